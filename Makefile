@@ -1,0 +1,41 @@
+# Needs Python 3.11 or newer and make; everything else goes into .venv.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+UV     ?= $(shell command -v uv)
+BIN    := .venv/bin
+READY  := .venv/.ready
+
+.PHONY: setup demo test slow bench lint lock clean
+setup: $(READY)
+
+$(READY): requirements.lock pyproject.toml
+	@rm -rf .venv
+	@$(PYTHON) -m venv .venv
+	@if [ -n "$(UV)" ] && $(UV) pip sync --quiet --require-hashes --python $(BIN)/python requirements.lock; then :; \
+	else $(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock; fi
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+demo: setup
+	@$(BIN)/lumidock demo --force
+
+test: lint
+	@$(BIN)/python -m pytest
+
+slow: setup
+	@$(BIN)/python -m pytest -m slow
+
+lint: setup
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+bench: setup
+	@$(BIN)/python -m bench
+
+lock:
+	@$(UV) pip compile pyproject.toml --quiet --all-extras --group dev --generate-hashes --universal --python-version 3.11 \
+	  --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" -o requirements.lock
+
+clean:
+	@rm -rf .venv demo-out bench-out

@@ -1,0 +1,309 @@
+"""A calibrated camera: projection, unprojection, their Jacobians, and ROS camera_info files.
+
+Points `p_cam` and rays `ray_cam` are in the optical frame (x right, y down, z forward); pixel (0, 0) is the centre of
+the top-left pixel. What the lens model cannot see (behind the camera, beyond the fold of its polynomial) is NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from lumidock.datatypes import Array, require_shape
+from lumidock.errors import InputError
+from lumidock.yamlfile import read_mapping, validate
+
+DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
+_COEFFICIENTS: dict[str, tuple[int, ...]] = {
+    "plumb_bob": (4, 5),
+    "rational_polynomial": (8,),
+    "equidistant": (4,),
+}
+_MAX_COEFFICIENT = 1e6  # beyond any lens, and far from what overflows
+_FOLD_MARGIN = 0.999
+_NEWTON_STEPS = 40
+_NEWTON_TOLERANCE = 1e-10  # in normalised image units: 2e-7 px at f = 2000 px
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """Image size, camera matrix `K` (3, 3) px and distortion coefficients in OpenCV's order."""
+
+    width: int
+    height: int
+    K: Array
+    model: DistortionModel = "plumb_bob"
+    distortion: Array = field(default_factory=lambda: np.zeros(5))
+    _fold: float = field(init=False)  # where the radial model ends: normalised radius, or angle in rad
+
+    def __post_init__(self) -> None:
+        require_shape("K", self.K, 3, 3)
+        if len(self.distortion) not in _COEFFICIENTS[self.model]:
+            raise ValueError(f"{self.model} takes {_COEFFICIENTS[self.model]} coefficients")
+        object.__setattr__(self, "_fold", _fold_of(self.model, self.distortion))
+
+    @property
+    def focal_px(self) -> Array:
+        """Focal lengths fx, fy (2,) px."""
+        return np.array([self.K[0, 0], self.K[1, 1]])
+
+    @property
+    def center_px(self) -> Array:
+        """Principal point cx, cy (2,) px."""
+        return np.asarray(self.K[:2, 2])
+
+    def contains(self, uv: Array, *, margin_px: float = 0.0) -> np.ndarray:
+        """Whether pixels `uv` (N, 2) lie inside the image by at least `margin_px`; NaN is outside. Returns (N,)."""
+        limit = np.array([self.width, self.height]) - 0.5 - margin_px
+        inside: np.ndarray = ((uv > margin_px - 0.5) & (uv < limit)).all(axis=-1)
+        return inside
+
+    def project(self, p_cam: Array) -> Array:
+        """Pixels `uv` (N, 2) of points `p_cam` (N, 3) m; NaN where the lens does not see the point."""
+        return self.project_with_jacobian(p_cam)[0]
+
+    def project_with_jacobian(self, p_cam: Array) -> tuple[Array, Array]:
+        """Pixels `uv` (N, 2) and J_uv_p (N, 2, 3) px/m of points `p_cam` (N, 3).
+
+        Source: OpenCV "Camera Calibration and 3D Reconstruction"; J. Kannala, S. Brandt, 2006 (equidistant).
+        """
+        if self.model == "equidistant":
+            xy, J = _distort_equidistant(p_cam, self.distortion, self._fold)
+        else:
+            xy, J = _distort_rational(p_cam, self.distortion, self._fold)
+        return xy * self.focal_px + self.center_px, J * self.focal_px[:, None]
+
+    def unproject(self, uv: Array) -> Array:
+        """Unit rays `ray_cam` (N, 3) of pixels `uv` (N, 2); NaN where no ray reaches the pixel."""
+        xy = (uv - self.center_px) / self.focal_px
+        if self.model == "equidistant":
+            return _undistort_equidistant(xy, self.distortion, self._fold)
+        return _undistort_rational(xy, self.distortion, self._fold)
+
+    def unproject_with_jacobian(self, uv: Array) -> tuple[Array, Array]:
+        """Unit rays `ray_cam` (N, 3) and J_ray_uv (N, 3, 2) 1/px of pixels `uv` (N, 2).
+
+        Source: implicit function theorem on `project_with_jacobian`; a unit ray moves only across itself, so its
+        Jacobian is the pseudo-inverse of J_uv_p at unit distance.
+        """
+        ray = self.unproject(uv)
+        _, J_uv_ray = self.project_with_jacobian(ray)
+        J = np.full((len(uv), 3, 2), np.nan)
+        good = np.isfinite(J_uv_ray).all(axis=(1, 2))
+        J[good] = np.linalg.pinv(J_uv_ray[good])
+        return ray, J
+
+
+def _rational_terms(distortion: Array) -> tuple[Array, Array, float, float]:
+    """Numerator and denominator polynomials in r^2 (lowest power first), and the tangential p1, p2."""
+    d = np.zeros(8)
+    d[: len(distortion)] = distortion
+    return np.array([1.0, d[0], d[1], d[4]]), np.array([1.0, d[5], d[6], d[7]]), float(d[2]), float(d[3])
+
+
+def _fold_of(model: str, distortion: Array) -> float:
+    """Radius (angle for equidistant) up to which the distorted radius grows; infinite if it always does.
+
+    A hair less than that, where Newton's method still converges.
+    """
+    poly = np.polynomial.polynomial
+    if model == "equidistant":
+        derivative = np.array([1.0, 3.0, 5.0, 7.0, 9.0]) * np.concatenate([[1.0], distortion])
+        return min(_FOLD_MARGIN * _first_root(derivative), np.pi)
+    num, den, _, _ = _rational_terms(distortion)
+    # d(r N/D)/dr = 0  <=>  (N + 2 u N') D - 2 u N D' = 0 with u = r^2; a pole D = 0 ends the model as well
+    twice_u = np.array([0.0, 2.0])
+    slope = poly.polysub(
+        poly.polymul(poly.polyadd(num, poly.polymul(twice_u, poly.polyder(num))), den),
+        poly.polymul(poly.polymul(twice_u, num), poly.polyder(den)),
+    )
+    return _FOLD_MARGIN * min(_first_root(slope), _first_root(den))
+
+
+def _first_root(coefficients: Array) -> float:
+    """Square root of the smallest positive real root of a polynomial in r^2, or infinity."""
+    told = np.where(np.abs(coefficients) < 1e-30, 0.0, coefficients)  # smaller ones overflow when divided by
+    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(told, "b"))
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    positive = real[real > 1e-12]
+    return float(np.sqrt(positive.min())) if positive.size else np.inf
+
+
+def _horner(coefficients: Array, u: Array) -> Array:
+    return np.polynomial.polynomial.polyval(u, coefficients)
+
+
+def _distort_xy(xy: Array, distortion: Array) -> tuple[Array, Array]:
+    """Distorted normalised coordinates (N, 2) and their Jacobian (N, 2, 2)."""
+    num, den, p1, p2 = _rational_terms(distortion)
+    x, y = xy[:, 0], xy[:, 1]
+    u = x * x + y * y
+    N, D = _horner(num, u), _horner(den, u)
+    g = N / D
+    dg = (_horner(np.polynomial.polynomial.polyder(num), u) - g * _horner(np.polynomial.polynomial.polyder(den), u)) / D
+    out = np.stack([x * g + 2 * p1 * x * y + p2 * (u + 2 * x * x), y * g + p1 * (u + 2 * y * y) + 2 * p2 * x * y], 1)
+    cross = 2 * x * y * dg + 2 * p1 * x + 2 * p2 * y
+    J = np.empty((len(xy), 2, 2))
+    J[:, 0, 0] = g + 2 * x * x * dg + 2 * p1 * y + 6 * p2 * x
+    J[:, 1, 1] = g + 2 * y * y * dg + 6 * p1 * y + 2 * p2 * x
+    J[:, 0, 1] = J[:, 1, 0] = cross
+    return out, J
+
+
+def _one_to_one(J: Array) -> NDArray[np.bool_]:
+    """Where the lens map is one to one (N,): it is a gradient, and `J` (N, 2, 2) its positive definite Hessian.
+
+    The radial fold alone does not tell: the tangential terms fold the map as well.
+    """
+    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+    return np.asarray((J[:, 0, 0] > 0.0) & (det > 0.0))
+
+
+def _distort_rational(p_cam: Array, distortion: Array, fold: float) -> tuple[Array, Array]:
+    z = np.where(p_cam[:, 2] > 0.0, p_cam[:, 2], np.nan)
+    xy = p_cam[:, :2] / z[:, None]
+    xy[np.hypot(xy[:, 0], xy[:, 1]) >= fold] = np.nan
+    out, J_xy = _distort_xy(xy, distortion)
+    out[~_one_to_one(J_xy)] = np.nan
+    J_xy[~_one_to_one(J_xy)] = np.nan
+    J_p = np.zeros((len(p_cam), 2, 3))
+    J_p[:, 0, 0] = J_p[:, 1, 1] = 1.0 / z
+    J_p[:, :, 2] = -xy / z[:, None]
+    return out, J_xy @ J_p
+
+
+def _undistort_rational(xy_distorted: Array, distortion: Array, fold: float) -> Array:
+    """Newton's method on the analytic Jacobian, kept inside the fold; NaN where it does not arrive."""
+    xy = _shorten(xy_distorted.copy(), fold)
+    with np.errstate(all="ignore"):  # a step that leaves the model is a NaN, and a NaN is the answer
+        for _ in range(_NEWTON_STEPS):
+            out, J = _distort_xy(xy, distortion)
+            error = out - xy_distorted
+            if np.all(np.abs(error) < _NEWTON_TOLERANCE):
+                break
+            det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+            step_x = (J[:, 1, 1] * error[:, 0] - J[:, 0, 1] * error[:, 1]) / det
+            step_y = (J[:, 0, 0] * error[:, 1] - J[:, 1, 0] * error[:, 0]) / det
+            xy = _shorten(xy - np.stack([step_x, step_y], 1), fold)
+        out, J = _distort_xy(xy, distortion)
+        residual = np.abs(out - xy_distorted).max(axis=1)
+        xy[~((residual < 1e-7) & _one_to_one(J))] = np.nan
+    ray = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+
+
+def _shorten(xy: Array, limit: float) -> Array:
+    """Pull points beyond radius `limit` back to it."""
+    if not np.isfinite(limit):
+        return xy
+    r = np.maximum(np.hypot(xy[:, 0], xy[:, 1]), 1e-300)
+    return np.asarray(xy * np.minimum(1.0, limit / r)[:, None])
+
+
+def _theta_distorted(theta: Array, distortion: Array) -> tuple[Array, Array]:
+    """Distorted angle and its derivative."""
+    powers = np.concatenate([[1.0], distortion])
+    u = theta * theta
+    return theta * _horner(powers, u), _horner(powers * np.array([1.0, 3.0, 5.0, 7.0, 9.0]), u)
+
+
+def _distort_equidistant(p_cam: Array, distortion: Array, fold: float) -> tuple[Array, Array]:
+    x, y, z = np.where((p_cam != 0.0).any(axis=1), p_cam.T, np.nan)  # the lens itself has no direction
+    r = np.hypot(x, y)
+    theta = np.arctan2(r, z)
+    theta = np.where(theta < fold, theta, np.nan)
+    bent, slope = _theta_distorted(theta, distortion)
+    near = r < 1e-9 * np.abs(z)  # on the axis bent / r tends to 1 / z
+    r_safe = np.where(near, 1.0, r)
+    scale = np.where(near, 1.0 / np.where(near, np.abs(z), 1.0), bent / r_safe)
+    out = p_cam[:, :2] * scale[:, None] + 0.0 * theta[:, None]
+    direction = np.where(near[:, None], 0.0, p_cam[:, :2] / r_safe[:, None])
+    norm2 = r * r + z * z
+    # d(bent)/d(r, z) = slope * (z, -r) / (r^2 + z^2)
+    radial = np.where(near, 0.0, slope * z / norm2 - scale)
+    J = np.zeros((len(p_cam), 2, 3))
+    J[:, :, :2] = radial[:, None, None] * direction[:, :, None] * direction[:, None, :]
+    J[:, 0, 0] += scale
+    J[:, 1, 1] += scale
+    J[:, :, 2] = -(slope * r / norm2)[:, None] * direction
+    J[np.isnan(theta)] = np.nan
+    return out, J
+
+
+def _undistort_equidistant(xy_distorted: Array, distortion: Array, fold: float) -> Array:
+    bent = np.hypot(xy_distorted[:, 0], xy_distorted[:, 1])
+    theta = np.minimum(bent, fold)
+    for _ in range(_NEWTON_STEPS):
+        value, slope = _theta_distorted(theta, distortion)
+        error = value - bent
+        if np.all(np.abs(error) < _NEWTON_TOLERANCE):
+            break
+        theta = np.clip(theta - error / slope, 0.0, fold)
+    theta = np.where(np.abs(_theta_distorted(theta, distortion)[0] - bent) < 1e-7, theta, np.nan)
+    direction = xy_distorted / np.maximum(bent, 1e-300)[:, None]
+    return np.concatenate([np.sin(theta)[:, None] * direction, np.cos(theta)[:, None]], axis=1)
+
+
+class _Matrix(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    rows: int = 0
+    cols: int = 0
+    data: list[float]
+
+
+class _CameraInfo(BaseModel):
+    """The part of ROS camera_info that lumidock reads; its other keys are let pass."""
+
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+    image_width: Annotated[int, Field(gt=0, le=32768)]
+    image_height: Annotated[int, Field(gt=0, le=32768)]
+    camera_matrix: _Matrix
+    distortion_model: DistortionModel
+    distortion_coefficients: _Matrix
+
+
+def load_camera(path: Path) -> Camera:
+    """Read a ROS camera_info YAML file.
+
+    Raises: InputError, one line, for what is missing, not finite, of the wrong length or not supported.
+    """
+    info = validate(_CameraInfo, read_mapping(path), str(path))
+    if len(info.camera_matrix.data) != 9:
+        raise InputError(f"{path}: camera_matrix: wanted 9 numbers")
+    K = np.array(info.camera_matrix.data).reshape(3, 3)
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or K[0, 1] != 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
+        raise InputError(f"{path}: camera_matrix: wanted [fx, 0, cx, 0, fy, cy, 0, 0, 1] with positive fx and fy")
+    distortion = np.array(info.distortion_coefficients.data)
+    if len(distortion) not in _COEFFICIENTS[info.distortion_model]:
+        wanted = " or ".join(map(str, _COEFFICIENTS[info.distortion_model]))
+        raise InputError(f"{path}: distortion_coefficients: {info.distortion_model} takes {wanted} numbers")
+    if (np.abs(distortion) > _MAX_COEFFICIENT).any():
+        raise InputError(f"{path}: distortion_coefficients: wanted numbers up to {_MAX_COEFFICIENT:.0e}")
+    return Camera(info.image_width, info.image_height, K, info.distortion_model, distortion)
+
+
+def save_camera(camera: Camera, path: Path, *, name: str = "camera") -> None:
+    """Write a ROS camera_info YAML file."""
+    fx, fy, cx, cy = (float(v) for v in (*camera.focal_px, *camera.center_px))
+
+    def matrix(rows: int, cols: int, data: list[float]) -> dict[str, object]:
+        return {"rows": rows, "cols": cols, "data": data}
+
+    coefficients = [float(v) for v in camera.distortion]
+    content = {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_name": name,
+        "camera_matrix": matrix(3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        "distortion_model": camera.model,
+        "distortion_coefficients": matrix(1, len(coefficients), coefficients),
+        "rectification_matrix": matrix(3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
+        "projection_matrix": matrix(3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
+    }
+    path.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")

@@ -1,0 +1,133 @@
+"""Everything that flows between the stages: frozen structs of arrays, shapes checked on creation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Indices = NDArray[np.int64]
+
+Status = Literal["none", "acquired", "tracking", "coasting"]
+Stage = Literal["search", "front", "transition", "rear"]
+MatchSource = Literal["pso", "btekf"]
+
+
+def require_shape(name: str, array: np.ndarray, *shape: int | None) -> None:
+    """Check an array's shape; `None` stands for any length.
+
+    Raises: ValueError naming the array and both shapes.
+    """
+    fits = array.ndim == len(shape) and all(
+        want is None or have == want for have, want in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        raise ValueError(f"{name} has shape {array.shape}, wanted {shape}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One picture: `image` (H, W) mono8 or (H, W, 3) bgr8, exposed at `t_ns`; `name` as its source calls it."""
+
+    name: str
+    t_ns: int
+    image: Image
+
+    def __post_init__(self) -> None:
+        if self.image.dtype != np.uint8:
+            raise ValueError(f"image is {self.image.dtype}, wanted uint8")
+        require_shape("image", self.image, *((None, None) if self.image.ndim == 2 else (None, None, 3)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detections:
+    """The N spots found in one frame.
+
+    `uv` (N, 2) px; `radius_px` (N,) equal-area radius at half peak; `flux` (N,) grey levels summed over the spot;
+    `p_light` (N,) probability of being a lamp; `p_rear` (N,) probability of belonging to the rear layer, NaN where
+    nothing is known.
+    """
+
+    frame: str
+    t_ns: int
+    uv: Array
+    radius_px: Array
+    flux: Array
+    p_light: Array
+    p_rear: Array
+
+    def __post_init__(self) -> None:
+        require_shape("uv", self.uv, None, 2)
+        for name in ("radius_px", "flux", "p_light", "p_rear"):
+            require_shape(name, getattr(self, name), len(self.uv))
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    @classmethod
+    def from_uv(cls, frame: str, t_ns: int, uv: Array, *, p_rear: Array | None = None) -> Self:
+        """Make detections of which only the centres `uv` (N, 2) px, and perhaps `p_rear` (N,), are known."""
+        unknown = np.full(len(uv), np.nan)
+        p_rear = unknown if p_rear is None else p_rear
+        return cls(frame, t_ns, np.asarray(uv, float).reshape(-1, 2), unknown, unknown, np.ones(len(uv)), p_rear)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Match:
+    """Which detection is which light: `light` (N,) holds indices into the station's lights, -1 for spurious."""
+
+    detections: Detections
+    light: Indices
+
+    def __post_init__(self) -> None:
+        require_shape("light", self.light, len(self.detections))
+        named = self.light[self.light >= 0]
+        if len(np.unique(named)) != len(named):
+            raise ValueError("a light is named twice in one match")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LayerPose:
+    """The pose `T_dock_cam` (4, 4) that one layer alone gave in one frame, and which step named its lights."""
+
+    layer: str
+    T_dock_cam: Array
+    n_used: int
+    source: MatchSource
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fix:
+    """The answer for one frame: `T_dock_cam` (4, 4) when `valid`, otherwise no pose and a `reason`.
+
+    `n_seen` counts the frame's detections and `n_used` those behind the pose; `by_layer` holds what each layer said
+    alone, where a method works by layer.
+    """
+
+    frame: str
+    t_ns: int
+    status: Status
+    stage: Stage
+    n_seen: int = 0
+    n_used: int = 0
+    T_dock_cam: Array | None = None
+    reason: str = ""
+    match: Match | None = None
+    by_layer: tuple[LayerPose, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        if (self.T_dock_cam is None) != bool(self.reason):
+            raise ValueError("a fix holds either a pose or the reason why there is none")
+        if self.T_dock_cam is not None:
+            require_shape("T_dock_cam", self.T_dock_cam, 4, 4)
+            if not np.isfinite(self.T_dock_cam).all():
+                raise ValueError("T_dock_cam is not finite")
+
+    @property
+    def valid(self) -> bool:
+        """Whether the full pose may be used."""
+        return self.T_dock_cam is not None

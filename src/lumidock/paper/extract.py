@@ -1,0 +1,206 @@
+"""Light extraction from a frame, paper section 3.1.1.
+
+The interval-adaptive Otsu threshold (the paper's [22]) is not specified there. Read here as: Otsu on the grey levels above
+the background's mode, repeated on the levels above each result until the classes separate; first for the whole frame, then
+within every region until its own light stands at half height.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from lumidock.config import ExtractConfig
+from lumidock.datatypes import Array, Detections, Frame, Image
+
+
+@dataclass(frozen=True, slots=True)
+class _Spot:
+    """One light found: circle centre (u, v) px, equal-area radius px, grey levels summed above the background."""
+
+    u: float
+    v: float
+    radius: float
+    flux: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Region:
+    """A connected region: the window of the gray image it lies in, the window's offset and the region's mask."""
+
+    gray: Image
+    mask: Image
+    offset: tuple[int, int]
+
+
+def lights(frame: Frame, config: ExtractConfig) -> Detections:
+    """Find the lights of a frame: centres, radii and fluxes; the layer is not known yet."""
+    gray = to_gray(frame.image, config.gray)
+    for background, threshold in separating_thresholds(gray, config):
+        binary, outlines = _outlines(gray, threshold)
+        if len(outlines) <= config.max_regions:
+            break
+    regions = _connected_regions(gray, binary, sorted(outlines, key=len)[-config.max_regions :])
+    spots = [spot for region in regions for spot in _spots(region, threshold, background, config)]
+    columns = np.array([[s.u, s.v, s.radius, s.flux] for s in spots]).reshape(-1, 4)
+    unknown = np.full(len(spots), np.nan)
+    uv, radius_px, flux = columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy()
+    return Detections(frame.name, frame.t_ns, uv, radius_px, flux, np.ones(len(spots)), unknown)
+
+
+def to_gray(image: Image, kind: str) -> Image:
+    """Gray image (H, W): the largest of the three channels, or luma, which weighs blue by 0.114."""
+    if image.ndim == 2:
+        return image
+    if kind == "luma":
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+    blue, green, red = cv2.split(image)
+    return np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
+
+
+def separating_thresholds(gray: Image, config: ExtractConfig) -> Iterator[tuple[int, int]]:
+    """The background's mode and thresholds that separate what is brighter, lowest first, in grey levels 0-255.
+
+    The next one is wanted when a threshold leaves more regions than there can be lights.
+    """
+    histogram = cv2.calcHist([gray], [0], None, [256], [0, 256]).ravel()
+    background = int(np.argmax(histogram[:255]))
+    floor = background + max(config.min_step, config.contrast * _spread_below(histogram, background))
+    threshold = background
+    while threshold < 254:
+        threshold = otsu(histogram, threshold + 1)
+        foreground = histogram[threshold + 1 :].sum() / gray.size
+        if threshold >= floor and foreground <= config.max_foreground:
+            yield background, threshold
+    yield background, 254
+
+
+def _spread_below(histogram: Array, mode: int) -> float:
+    """Standard deviation of the background, from the half of its histogram that no light reaches."""
+    below = histogram[: mode + 1]
+    steps = np.arange(mode, -1, -1.0)
+    return float(np.sqrt((below * steps**2).sum() / below.sum()))
+
+
+def otsu(histogram: Array, low: int) -> int:
+    """Otsu's threshold over the grey levels from `low` up; `low` itself when only one level is left.
+
+    Source: N. Otsu, 1979: the cut that maximises the between-class variance.
+    """
+    counts = np.asarray(histogram[low:], float)
+    levels = np.arange(low, len(histogram))
+    weight = np.cumsum(counts)
+    moment = np.cumsum(counts * levels)
+    total, mean = weight[-1], moment[-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = (mean * weight - total * moment) ** 2 / (weight * (total - weight))
+    if not np.isfinite(between).any():
+        return low
+    return int(levels[int(np.nanargmax(np.where(np.isfinite(between), between, -1.0)))])
+
+
+def _outlines(gray: Image, threshold: int) -> tuple[Image, list[Array]]:
+    """The binarised frame and the outlines of its Canny edges."""
+    _, binary = cv2.threshold(gray, threshold, 255, cv2.THRESH_BINARY)
+    edges = cv2.dilate(cv2.Canny(binary, 100, 200), np.ones((3, 3), np.uint8))  # closes the gaps Canny leaves
+    contours, _ = cv2.findContours(edges, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    return np.asarray(binary, np.uint8), list(contours)
+
+
+def _connected_regions(gray: Image, binary: Image, outlines: list[Array]) -> Iterator[_Region]:
+    """The connected regions inside the outlines."""
+    for outline in outlines:
+        u, v, width, height = cv2.boundingRect(outline)
+        window = np.s_[v : v + height, u : u + width]
+        inside = cv2.drawContours(np.zeros((height, width), np.uint8), [outline], -1, 255, cv2.FILLED, offset=(-u, -v))
+        yield from _components(gray[window], cv2.bitwise_and(binary[window], inside), (u, v))
+
+
+def _components(gray: Image, binary: Image, offset: tuple[int, int]) -> Iterator[_Region]:
+    """Connected components of a binary window, each in a window of its own."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(binary, connectivity=8)
+    for label in range(1, count):
+        u, v, width, height = (int(x) for x in stats[label, :4])
+        window = np.s_[v : v + height, u : u + width]
+        mask = np.asarray((labels[window] == label) * np.uint8(255))
+        yield _Region(gray[window], mask, (offset[0] + u, offset[1] + v))
+
+
+def _spots(region: _Region, threshold: int, background: int, config: ExtractConfig) -> Iterator[_Spot]:
+    """Lights in a region: opened, cut at its own Otsu level until each piece stands at half height, then judged."""
+    for piece in _opened(region, config):
+        inside = piece.gray[piece.mask > 0]
+        peak = int(inside.max())
+        half = background + 0.5 * (peak - background)
+        higher = threshold
+        if threshold < half and inside.size > config.min_area_px:
+            higher = min(otsu(np.bincount(inside, minlength=256), threshold + 1), int(half))
+        if higher > threshold:
+            _, binary = cv2.threshold(cv2.bitwise_and(piece.gray, piece.mask), higher, 255, cv2.THRESH_BINARY)
+            for part in _components(piece.gray, np.asarray(binary, np.uint8), piece.offset):
+                yield from _spots(part, higher, background, config)
+            continue
+        spot = _measure(piece, background, config)
+        if spot is not None:
+            yield spot
+
+
+def _opened(region: _Region, config: ExtractConfig) -> Iterator[_Region]:
+    """Morphological opening with a radius from the distance transform: cuts the bridges where halos touch."""
+    depth = cv2.distanceTransform(cv2.copyMakeBorder(region.mask, 1, 1, 1, 1, cv2.BORDER_CONSTANT), cv2.DIST_L2, 3)
+    radius = int(config.opening * float(depth.max()))
+    if radius < 1:
+        yield region
+        return
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    padded = cv2.copyMakeBorder(region.mask, radius, radius, radius, radius, cv2.BORDER_CONSTANT)
+    opened = cv2.morphologyEx(padded, cv2.MORPH_OPEN, kernel)[radius:-radius, radius:-radius]
+    yield from _components(region.gray, np.asarray(opened, np.uint8), region.offset)
+
+
+def _measure(piece: _Region, background: int, config: ExtractConfig) -> _Spot | None:
+    """Circle, roundness and compactness of a piece; None when it is no light."""
+    contours, _ = cv2.findContours(piece.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline = max(contours, key=len)[:, 0, :].astype(float)
+    area = float(np.count_nonzero(piece.mask))
+    if area < config.min_area_px or len(outline) < 3:
+        return None
+    weights = np.where(piece.mask > 0, piece.gray.astype(float) - background, 0.0)
+    flux = float(weights.sum())
+    if area < config.small_area_px:
+        center = _centroid(weights)
+        radius = np.sqrt(area / np.pi)
+    else:
+        center, radius = fit_circle(outline)
+        if not _is_round(outline, area, radius, config):
+            return None
+    if radius > config.max_radius_px:
+        return None
+    return _Spot(center[0] + piece.offset[0], center[1] + piece.offset[1], float(np.sqrt(area / np.pi)), flux)
+
+
+def _centroid(weights: Array) -> Array:
+    """Centre (2,) of a spot too small for a circle, weighted by its grey levels."""
+    rows, columns = np.indices(weights.shape)
+    return np.asarray([(weights * columns).sum(), (weights * rows).sum()] / weights.sum())
+
+
+def fit_circle(points: Array) -> tuple[Array, float]:
+    """Least-squares circle through `points` (N, 2): centre (2,) and radius. Source: I. Kasa, 1976."""
+    mean = points.mean(axis=0)
+    x, y = (points - mean).T
+    A = np.stack([2.0 * x, 2.0 * y, np.ones(len(x))], axis=1)
+    (a, b, c), *_ = np.linalg.lstsq(A, x * x + y * y, rcond=None)
+    return mean + [a, b], float(np.sqrt(max(c + a * a + b * b, 0.0)))
+
+
+def _is_round(outline: Array, area: float, radius: float, config: ExtractConfig) -> bool:
+    """The two shape measures: roundness 4 pi A / P^2 and compactness, the area against the fitted circle's."""
+    perimeter = float(np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1).sum())
+    roundness = 4.0 * np.pi * area / max(perimeter, 1e-9) ** 2
+    disc = np.pi * radius**2
+    compactness = min(area, disc) / max(area, disc, 1e-9)
+    return roundness >= config.min_roundness and compactness >= config.min_compactness

@@ -1,0 +1,34 @@
+"""The four docking stages and the hand-over from the front to the rear layer, paper sections 2.2 and 4.2."""
+
+from __future__ import annotations
+
+from lumidock.datatypes import LayerPose, Stage
+
+
+class Guidance:
+    """Chooses the layer that guides and names the stage; remembers both.
+
+    `layers` are (name, number of lights), front first; with one layer there is no hand-over.
+    """
+
+    def __init__(self, layers: list[tuple[str, int]]) -> None:
+        self._front, self._n_front = layers[0]
+        self._rear, self._n_rear = layers[1] if len(layers) > 1 else ("", 0)
+        self._on_rear = False
+        self.stage: Stage = "search"
+
+    def choose(self, poses: dict[str, LayerPose]) -> LayerPose | None:
+        """The pose that guides in this frame: the rear layer's from the frame on that shows all of its lights."""
+        front, rear = poses.get(self._front), poses.get(self._rear)
+        self.stage = self._next_stage(front, rear)
+        self._on_rear = rear is not None and (self._on_rear or rear.n_used == self._n_rear)
+        return rear if self._on_rear or front is None else front
+
+    def _next_stage(self, front: LayerPose | None, rear: LayerPose | None) -> Stage:
+        if front is not None and rear is not None:
+            return "transition"
+        if rear is not None:
+            return "rear"
+        if front is None:
+            return self.stage
+        return "front" if front.n_used == self._n_front or self.stage in ("front", "transition") else "search"

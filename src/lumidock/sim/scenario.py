@@ -1,0 +1,175 @@
+"""What is simulated: the path of the camera and every knob of water, lights, camera and faults, read from YAML."""
+
+from __future__ import annotations
+
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
+
+from lumidock.datatypes import Array
+from lumidock.errors import InputError
+from lumidock.geometry import so3_exp
+from lumidock.yamlfile import read_mapping, validate
+
+R_DOCK_CAM_HEAD_ON = np.diag([1.0, -1.0, -1.0])
+Triple = tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat]
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Path3D(_Section):
+    """The camera's path. `approach` runs along the dock's axis; `rectangle` goes once round at a constant z."""
+
+    kind: Literal["approach", "rectangle"] = "approach"
+    start_z_m: float = 30.0
+    end_z_m: float = -3.0
+    speed_m_s: PositiveFloat = 1.0
+    frame_interval_s: PositiveFloat = 0.15
+    half_width_m: PositiveFloat = 9.0  # of the rectangle
+    half_height_m: PositiveFloat = 7.5
+    sway_m: Triple = (0.7, 0.7, 0.0)  # largest excursion in x, y, z
+    sway_deg: Triple = (2.1, 2.1, 3.0)  # largest pitch, yaw, roll
+    near_sway_m: Triple = (0.035, 0.035, 0.0)  # the same, at and below taper_z_m[1]
+    near_sway_deg: Triple = (0.35, 0.35, 0.5)
+    taper_z_m: tuple[float, float] = (15.0, 2.0)  # the sway shrinks between these
+    sway_period_s: tuple[PositiveFloat, PositiveFloat] = (7.0, 20.0)
+
+
+class Water(_Section):
+    """Absorption and scattering 1/m in three bands (455, 530, 610 nm); the defaults are Jerlov type III.
+
+    Source: Williamson & Hollins 2022; Solonenko & Mobley 2015.
+    """
+
+    absorption: Triple = (0.107, 0.081, 0.287)
+    scattering: Triple = (0.308, 0.291, 0.277)
+    ambient_e: Triple = (25.0, 30.0, 8.0)  # electrons per pixel and exposure of 2 ms, in B, G, R
+
+
+class Sensor(_Section):
+    """IMX264 behind 7.2 mm f/2.8; source: Sony's data sheet figures as measured to EMVA 1288."""
+
+    exposure_ms: PositiveFloat = 2.0
+    full_well_e: PositiveFloat = 10700.0
+    read_noise_e: NonNegativeFloat = 2.3
+    gamma: PositiveFloat = 2.2
+    blur_px: PositiveFloat = 0.7  # 1 sigma of the lens
+
+
+class Faults(_Section):
+    """What goes wrong with the lights."""
+
+    missing: NonNegativeInt = 0  # front lights dark in each frame, drawn anew
+    spurious: NonNegativeInt = 0  # lights that wander over the whole picture
+
+
+class Spots(_Section):
+    """Bare detections, made without rendering."""
+
+    noise_px: NonNegativeFloat = 0.5
+    front_range_m: PositiveFloat = 40.0  # beyond it a layer is not seen
+    rear_range_m: PositiveFloat = 20.0
+    wrong_layer: Probability = 0.0
+
+
+class Scenario(_Section):
+    """Everything that a seed does not decide."""
+
+    name: str = "approach"
+    about: str = ""
+    path: Path3D = Path3D()
+    water: Water = Water()
+    sensor: Sensor = Sensor()
+    faults: Faults = Faults()
+    spots: Spots = Spots()
+
+
+def shipped_scenarios() -> list[str]:
+    """Names of the scenarios that come with the package."""
+    folder = files("lumidock.sim") / "scenarios"
+    return sorted(Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+
+
+def load_scenario(name: str, settings: tuple[str, ...] = ()) -> Scenario:
+    """Read a scenario, shipped or a file, and apply `key.subkey=value` settings.
+
+    Raises: InputError, one line, for an unknown name, key or value.
+    """
+    if name in shipped_scenarios():
+        with as_file(files("lumidock.sim") / "scenarios" / f"{name}.yaml") as path:
+            content = read_mapping(path)
+    elif Path(name).suffix in (".yaml", ".yml"):
+        content = read_mapping(Path(name))
+    else:
+        raise InputError(f"{name}: no such scenario; there are {', '.join(shipped_scenarios())}, or give a .yaml file")
+    for setting in settings:
+        _apply(content, setting)
+    return validate(Scenario, content, name)
+
+
+def _apply(content: dict[str, Any], setting: str) -> None:
+    """Put one `key.subkey=value` into nested content."""
+    key, equals, value = setting.partition("=")
+    *parents, last = key.strip().split(".")
+    for parent in parents:
+        content = content.setdefault(parent, {})
+        if not isinstance(content, dict):
+            raise InputError(f"--set {setting}: {parent} takes no sub-keys")
+    if not equals or not last:
+        raise InputError(f"--set {setting}: wanted key=value")
+    try:
+        content[last] = yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise InputError(f"--set {setting}: the value is not valid YAML") from None
+
+
+def trajectory(scenario: Scenario, rng: np.random.Generator) -> tuple[np.ndarray, Array]:
+    """Stamps `t_ns` (N,) and true poses `T_dock_cam` (N, 4, 4) of a scenario."""
+    path = scenario.path
+    nominal = _approach(path) if path.kind == "approach" else _rectangle(path)
+    t_s = np.arange(len(nominal)) * path.frame_interval_s
+    share = np.clip((nominal[:, 2] - path.taper_z_m[1]) / (path.taper_z_m[0] - path.taper_z_m[1]), 0.0, 1.0)[:, None]
+    sway = _wander(t_s, 6, path.sway_period_s, rng)
+    shift = sway[:, :3] * (np.array(path.near_sway_m) * (1 - share) + np.array(path.sway_m) * share)
+    turn = sway[:, 3:] * np.deg2rad(np.array(path.near_sway_deg) * (1 - share) + np.array(path.sway_deg) * share)
+    T_dock_cam = np.tile(np.eye(4), (len(t_s), 1, 1))
+    T_dock_cam[:, :3, :3] = [R_DOCK_CAM_HEAD_ON @ so3_exp(w) for w in turn]
+    T_dock_cam[:, :3, 3] = nominal + shift
+    return np.round(t_s * 1e9).astype(np.int64), T_dock_cam
+
+
+def _approach(path: Path3D) -> Array:
+    count = round(abs(path.start_z_m - path.end_z_m) / (path.speed_m_s * path.frame_interval_s)) + 1
+    z = path.start_z_m + np.arange(count) * np.sign(path.end_z_m - path.start_z_m) * path.speed_m_s * path.frame_interval_s
+    return np.stack([np.zeros(count), np.zeros(count), z], axis=1)
+
+
+def _rectangle(path: Path3D) -> Array:
+    w, h = path.half_width_m, path.half_height_m
+    corners = np.array([[-w, -h], [-w, h], [w, h], [w, -h], [-w, -h]])
+    sides = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    along = np.arange(0.0, sides[-1], path.speed_m_s * path.frame_interval_s)
+    x, y = (np.interp(along, sides, corners[:, axis]) for axis in (0, 1))
+    return np.stack([x, y, np.full(len(along), path.start_z_m)], axis=1)
+
+
+def _wander(t_s: Array, count: int, period_s: tuple[float, float], rng: np.random.Generator) -> Array:
+    """Smooth random signals (N, count), each a sum of three sines that never leaves [-1, 1]."""
+    periods = rng.uniform(*period_s, (3, count))
+    phases = rng.uniform(0.0, 2 * np.pi, (3, count))
+    shares = rng.dirichlet(np.full(3, 3.0), count).T
+    return np.asarray((shares * np.sin(2 * np.pi * t_s[:, None, None] / periods + phases)).sum(axis=1))
+
+
+def spurious_paths(scenario: Scenario, t_ns: np.ndarray, size: tuple[int, int], rng: np.random.Generator) -> Array:
+    """Pixels (N, S, 2) of the spurious lights, wandering over an image of `size` (width, height)."""
+    count = scenario.faults.spurious
+    steps = _wander(t_ns * 1e-9, 2 * count, (3.0, 12.0), rng).reshape(len(t_ns), count, 2)
+    return np.asarray((0.5 + 0.49 * np.clip(1.6 * steps, -1.0, 1.0)) * np.array(size))

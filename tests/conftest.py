@@ -1,0 +1,78 @@
+"""What the tests share: seeded draws, strategies for SE(3), numeric derivatives, the shape of a refusal."""
+
+import zlib
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from lumidock.errors import InputError
+
+settings.register_profile("lumidock", derandomize=True, deadline=None, database=None, max_examples=200)
+settings.load_profile("lumidock")
+
+
+@pytest.fixture
+def rng(request):
+    """Random generator seeded by the test's name; a failing test's report names the seed."""
+    seed = zlib.crc32(request.node.nodeid.encode())
+    request.node.add_report_section("setup", "rng", f"numpy.random.default_rng({seed})")
+    return np.random.default_rng(seed)
+
+
+@st.composite
+def rotation_vectors(draw):
+    """Rotation vectors (3,) rad up to pi long: uniform, tangent-normal, near identity and near pi."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    tiny = 10.0 ** rng.uniform(-18, -1)
+    return {
+        "uniform": Rotation.random(rng=rng).as_rotvec(),
+        "normal": axis * min(abs(rng.normal()), np.pi),
+        "near identity": axis * tiny,
+        "near pi": axis * (np.pi - tiny),
+        "none": np.zeros(3),
+    }[draw(st.sampled_from(["uniform", "normal", "near identity", "near pi", "none"]))]
+
+
+def vectors(limit):
+    """Vectors (3,) within a cube of half width `limit`."""
+    return st.tuples(*[st.floats(-limit, limit)] * 3).map(np.array)
+
+
+def tangents(limit_m=30.0):
+    """Tangent vectors (6,) of SE(3), [m, rad]."""
+    return st.builds(lambda t, w: np.concatenate([t, w]), vectors(limit_m), rotation_vectors())
+
+
+def transform(t, w):
+    """Transform (4, 4) of a translation and a rotation vector, by scipy alone."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(w).as_matrix()
+    T[:3, 3] = t
+    return T
+
+
+def transforms(limit_m=30.0):
+    """Transforms (4, 4)."""
+    return st.builds(transform, vectors(limit_m), rotation_vectors())
+
+
+def numeric_jacobian(function, x, step=1e-6):
+    """Central differences of `function` at `x` (n,): the value's shape with an axis of n behind it."""
+    moves = step * np.eye(len(x))
+    return np.stack([(function(x + move) - function(x - move)) / (2 * step) for move in moves], axis=-1)
+
+
+@contextmanager
+def refused(path, match):
+    """An InputError of one line that names `path` and says `match`."""
+    with pytest.raises(InputError, match=match) as caught:
+        yield
+    text = str(caught.value)
+    assert len(text.splitlines()) == 1
+    assert str(path) in text

@@ -1,0 +1,94 @@
+from dataclasses import FrozenInstanceError, replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lumidock.datatypes import Detections, Fix, Frame, Match, require_shape
+
+THREE = Detections.from_uv("a.png", 5, np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))
+T = np.eye(4)
+
+
+@given(
+    st.lists(st.integers(0, 3), max_size=4).map(tuple),
+    st.lists(st.one_of(st.none(), st.integers(0, 3)), max_size=4).map(tuple),
+)
+def test_require_shape_takes_what_fits_and_nothing_else(shape, wanted):
+    array = np.zeros(shape)
+    if len(shape) == len(wanted) and all(w in (None, s) for s, w in zip(shape, wanted, strict=True)):
+        require_shape("it", array, *wanted)
+    else:
+        with pytest.raises(ValueError, match="it has shape"):
+            require_shape("it", array, *wanted)
+
+
+@pytest.mark.parametrize("shape", [(4, 6), (4, 6, 3)])
+def test_a_frame_is_grey_or_color(shape):
+    assert Frame("a.png", 0, np.zeros(shape, np.uint8)).image.shape == shape
+
+
+@pytest.mark.parametrize(
+    ("image", "match"),
+    [
+        (np.zeros((4, 6), np.uint16), "wanted uint8"),
+        (np.zeros((4, 6)), "wanted uint8"),
+        (np.zeros(4, np.uint8), "image has shape"),
+        (np.zeros((4, 6, 1), np.uint8), "image has shape"),
+        (np.zeros((4, 6, 4), np.uint8), "image has shape"),
+    ],
+)
+def test_another_image_is_refused(image, match):
+    with pytest.raises(ValueError, match=match):
+        Frame("a.png", 0, image)
+
+
+def test_detections_from_uv_know_only_their_places():
+    assert len(THREE) == 3
+    assert (THREE.p_light == 1).all()
+    assert np.isnan([THREE.radius_px, THREE.flux, THREE.p_rear]).all()
+    assert (Detections.from_uv("a.png", 5, THREE.uv, p_rear=np.full(3, 0.5)).p_rear == 0.5).all()
+    assert Detections.from_uv("a.png", 5, []).uv.shape == (0, 2)
+
+
+@pytest.mark.parametrize("name", ["uv", "radius_px", "flux", "p_light", "p_rear"])
+def test_detections_of_unequal_length_are_refused(name):
+    with pytest.raises(ValueError, match="has shape"):
+        replace(THREE, **{name: getattr(THREE, name)[:2]})
+
+
+@pytest.mark.parametrize("light", [[0, 1, 2], [7, -1, -1], [-1, -1, -1]])
+def test_a_match_names_each_light_once(light):
+    assert Match(THREE, np.array(light)).light.tolist() == light
+
+
+@pytest.mark.parametrize(("light", "match"), [([0, 1, 0], "named twice"), ([0, 1], "has shape")])
+def test_another_match_is_refused(light, match):
+    with pytest.raises(ValueError, match=match):
+        Match(THREE, np.array(light))
+
+
+def test_a_fix_is_valid_when_it_has_a_pose():
+    assert Fix("a.png", 5, "acquired", "front", T_dock_cam=T).valid
+    assert not Fix("a.png", 5, "none", "search", reason="no_lights").valid
+
+
+@pytest.mark.parametrize(
+    ("fields", "match"),
+    [
+        ({}, "either a pose or the reason"),
+        ({"T_dock_cam": T, "reason": "mirror"}, "either a pose or the reason"),
+        ({"T_dock_cam": T[:3]}, "has shape"),
+        ({"T_dock_cam": T * np.nan}, "not finite"),
+        ({"T_dock_cam": T + np.diag([np.inf, 0, 0, 0])}, "not finite"),
+    ],
+)
+def test_another_fix_is_refused(fields, match):
+    with pytest.raises(ValueError, match=match):
+        Fix("a.png", 5, "tracking", "front", **fields)
+
+
+def test_nothing_changes_once_made():
+    with pytest.raises(FrozenInstanceError):
+        THREE.t_ns = 6

@@ -1,0 +1,106 @@
+import os
+
+import pytest
+from conftest import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel, ConfigDict
+
+from lumidock.errors import InputError
+from lumidock.yamlfile import MAX_BYTES, read_mapping, validate
+
+REFUSALS = {
+    "empty": (b"", "keys and values"),
+    "list": (b"[1, 2]", "keys and values"),
+    "scalar": (b"word", "keys and values"),
+    "binary": (bytes(range(256)), "not valid YAML"),
+    "control character": (b"a: \x00", "not valid YAML"),
+    "open bracket": (b"a: [1,\n2", "not valid YAML"),
+    "tab": (b"a:\n\t- 1", "not valid YAML"),
+    "two documents": (b"a: 1\n---\nb: 2", "single document"),
+    "key twice": (b"a: 1\nb: 2\na: 3", "'a' given twice"),
+    "inner key twice": (b"a: {b: 1, b: 2}", "'b' given twice"),
+    "list as key": (b"? [1, 2]\n: 3", "unhashable"),
+    "alias": (b"a: &x [1]\nb: *x", "aliases are not allowed"),
+    "merge": (b"<<: {a: 1}", "not valid YAML"),
+    "python tag": (b"a: !!python/object/apply:os.getcwd []", "tags are not allowed"),
+    "wrong bool tag": (b'a: !!bool "perhaps"', "tags are not allowed"),
+    "empty int tag": (b'a: !!int ""', "tags are not allowed"),
+    "wrong time tag": (b"a: !!timestamp noon", "tags are not allowed"),
+    "no such day": (b"a: 2001-99-99", "month must be"),
+    "endless integer": (b"a: " + b"1" * 5000, "digits"),
+    "20,000 brackets": (b"a: " + b"[" * 20_000, "nested deeper than 20"),
+    "20,000 braces": (b"{a: " * 20_000, "nested deeper than 20"),
+    "20,000 dashes": (b"- " * 20_000, "nested deeper than 20"),
+    "over 1 MiB": (b"# " + b"x" * MAX_BYTES, "larger than 1048576 bytes"),
+}
+
+
+@pytest.mark.parametrize(("content", "match"), REFUSALS.values(), ids=REFUSALS)
+def test_a_bad_file_is_refused(content, match, tmp_path):
+    path = tmp_path / "file.yaml"
+    path.write_bytes(content)
+    with refused(path, match):
+        read_mapping(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "match"), [("absent.yaml", "No such file"), (".", "Is a directory"), ("nul\0byte", "null byte")]
+)
+def test_what_is_no_file_is_refused(name, match, tmp_path):
+    with refused(tmp_path / name, match):
+        read_mapping(tmp_path / name)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="needs an endless file")
+def test_an_endless_file_is_refused(tmp_path):
+    path = tmp_path / "endless.yaml"
+    path.symlink_to("/dev/zero")
+    with refused(path, "larger than"):
+        read_mapping(path)
+
+
+@given(st.one_of(st.binary(max_size=60), st.text("[]{}:,-?&*!|>%@#'\"\\ \n\tab01.~<=_", max_size=60)))
+def test_any_content_gives_a_mapping_or_one_line(tmp_path_factory, content):
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    mapping, refusal = {}, ""
+    try:
+        mapping = read_mapping(path)
+    except InputError as error:
+        refusal = str(error)
+    assert isinstance(mapping, dict)
+    assert len(refusal.splitlines()) <= 1
+
+
+def test_a_mapping_is_read_as_it_stands(tmp_path):
+    path = tmp_path / "file.yaml"
+    path.write_text("\ufeffname: dök\nnested: {list: [1, 2.5, true, ~]}\n", encoding="utf-8")
+    assert read_mapping(path) == {"name": "dök", "nested": {"list": [1, 2.5, True, None]}}
+
+
+class Settings(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    gain: float
+    inner: dict[str, int] = {}
+
+
+def test_validate_returns_the_model():
+    assert validate(Settings, {"gain": 2}, "here") == Settings(gain=2.0)
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        ({}, "here: gain: Field required"),
+        ({"gain": 1, "gian": 2}, "here: gian: unknown key"),
+        ({"gain": 1, "two\nlines\x85": 2}, "here: two lines: unknown key"),
+        ({"gain": 1, 5: 2}, "here: 5: Keys should be strings"),
+        ({"gain": 1, "inner": {"a": "b"}}, "here: inner.a: Input should be a valid integer"),
+    ],
+)
+def test_validate_names_the_place(content, text):
+    with pytest.raises(InputError) as caught:
+        validate(Settings, content, "here")
+    assert str(caught.value).startswith(text)
+    assert len(str(caught.value).splitlines()) == 1
