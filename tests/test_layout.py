@@ -2,7 +2,7 @@ from itertools import combinations, permutations
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from conftest import assert_close
 from scipy.optimize import minimize
 
 from lumidock.layout import worst_confusion
@@ -34,7 +34,7 @@ def test_worst_confusion_agrees_with_a_numeric_search(seen, mirrored, rng):
         for names in permutations(range(4), seen):
             if mirrored or names != subset:
                 expected = min(expected, *(fit(p_dock[list(names), :2], view) for view in views))
-    assert_allclose(worst_confusion(p_dock, seen=seen, mirrored=mirrored), expected, atol=1e-5)
+    assert_close(worst_confusion(p_dock, seen=seen, mirrored=mirrored), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -49,14 +49,21 @@ def test_worst_confusion_agrees_with_a_numeric_search(seen, mirrored, rng):
     ],
 )
 def test_layouts_that_cannot_be_told_apart(p_dock, seen, options, expected):
-    assert_allclose(worst_confusion(np.asarray(p_dock, float), seen=seen, **options), expected, atol=1e-7)
+    assert_close(worst_confusion(np.asarray(p_dock, float), seen=seen, **options), expected, atol=1e-7)
+
+
+@pytest.mark.parametrize(("size", "alike"), [(0.45, False), (0.55, True)])
+def test_a_part_of_half_the_size_is_no_confusion(size, alike):
+    triangle = np.array([[0, 0, 0], [2, 0, 0], [0.3, 1.2, 0]])
+    p_dock = np.vstack([triangle, size * triangle + [5, 7, 0]])
+    assert (worst_confusion(p_dock, seen=3) < 1e-7) == alike
 
 
 def test_confusion_grows_with_the_layout_and_forgets_its_place(rng):
     p_dock = rng.uniform(-1, 1, (5, 3))
     one = worst_confusion(p_dock, seen=3)
     assert one > 0
-    assert_allclose(worst_confusion(3 * p_dock + [5, -2, 9], seen=3), 3 * one)
+    assert_close(worst_confusion(3 * p_dock + [5, -2, 9], seen=3), 3 * one)
 
 
 def test_more_roll_never_makes_a_layout_safer(rng):

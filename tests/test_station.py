@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 import yaml
-from conftest import refused
-from numpy.testing import assert_allclose, assert_array_equal
+from conftest import assert_close, refused
+from numpy.testing import assert_array_equal
 
 from lumidock.station import load_station
 
@@ -59,7 +59,7 @@ def test_defaults_are_those_of_the_contract(load):
 def test_every_key_is_read(load):
     station = load(FULL)
     assert len(station) == 4
-    assert_allclose(station.axis, [[0, 0.6, 0.8], [0, 0, 1], [0, 0, 1], [0, 0, 1]])
+    assert_close(station.axis, [[0, 0.6, 0.8], [0, 0, 1], [0, 0, 1], [0, 0, 1]])
     assert_array_equal(station.beam_deg, [60, 120, 120, 120])
     assert_array_equal(station.power_w, [0.5, 2, 2, 2])
     assert_array_equal(station.docking_point, [0, 0.1, -3])
@@ -88,8 +88,8 @@ def test_any_lights_survive_their_file(n, load, rng):
     ]
     station = load(yaml.safe_dump({"schema": 1, "name": "any", "lights": lights}))
     assert_array_equal(station.p_dock, p_dock)
-    assert_allclose(np.cross(station.axis, axis), 0.0, atol=1e-13)
-    assert_allclose(np.linalg.norm(station.axis, axis=1), 1.0)
+    assert_close(np.cross(station.axis, axis), 0.0, atol=1e-13)
+    assert_close(np.linalg.norm(station.axis, axis=1), 1.0)
     assert [station.layers[i] for i in station.layer] == [f"layer{i}" for i in layer]
     depths = [p_dock[station.lights_of(name), 2].mean() for name in station.layers_front_to_rear()]
     assert depths == sorted(depths, reverse=True)

@@ -1,4 +1,5 @@
 import os
+from threading import Thread
 
 import pytest
 from conftest import refused
@@ -52,12 +53,24 @@ def test_what_is_no_file_is_refused(name, match, tmp_path):
         read_mapping(tmp_path / name)
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="needs an endless file")
-def test_an_endless_file_is_refused(tmp_path):
-    path = tmp_path / "endless.yaml"
-    path.symlink_to("/dev/zero")
+def test_a_pipe_is_capped_as_well(tmp_path):
+    path = tmp_path / "pipe.yaml"
+    os.mkfifo(path)
+
+    cut_off = []
+
+    def feed():
+        try:
+            path.write_bytes(bytes(4 * MAX_BYTES))
+        except BrokenPipeError:
+            cut_off.append(True)
+
+    writer = Thread(target=feed)
+    writer.start()
     with refused(path, "larger than"):
         read_mapping(path)
+    writer.join()
+    assert cut_off
 
 
 @given(st.one_of(st.binary(max_size=60), st.text("[]{}:,-?&*!|>%@#'\"\\ \n\tab01.~<=_", max_size=60)))

@@ -22,9 +22,10 @@ class ExtractConfig(Section):
     """Light extraction, paper section 3.1.1."""
 
     gray: Literal["max", "luma"] = "max"  # luma weighs blue by 0.114 and loses the rear layer
-    contrast: PositiveFloat = 3.0  # Otsu repeats until the classes lie this many background sigmas apart ...
-    max_foreground: Fraction = 0.02  # ... and no more than this share of the frame is foreground
+    contrast: PositiveFloat = 5.0  # sigmas of the background that a threshold, or a spot's peak, must clear ...
+    max_foreground: Fraction = 0.02  # ... with no more than this share of the frame as foreground
     min_step: PositiveFloat = 4.0  # grey levels above the background mode below which nothing is a light
+    class_gap: PositiveFloat = 5.0  # a core this many sigmas above its rim is cut out of it; a blurred disc has 3
     opening: Fraction = 0.5  # radius of the opening, as a share of the region's largest distance to its edge
     min_area_px: PositiveInt = 4
     max_radius_px: PositiveFloat = 150.0

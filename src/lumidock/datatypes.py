@@ -76,6 +76,16 @@ class Detections:
         return cls(frame, t_ns, np.asarray(uv, float).reshape(-1, 2), unknown, unknown, np.ones(len(uv)), p_rear)
 
 
+@dataclass(frozen=True, slots=True)
+class Unusable:
+    """A frame that could not be read; `t_ns` is None when its stamp could not either. `reason` is the fixed word."""
+
+    frame: str
+    t_ns: int | None
+    reason: str
+    text: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
     """Which detection is which light: `light` (N,) holds indices into the station's lights, -1 for spurious."""

@@ -45,6 +45,7 @@ def lights(frame: Frame, config: ExtractConfig) -> Detections:
             break
     regions = _connected_regions(gray, binary, sorted(outlines, key=len)[-config.max_regions :])
     spots = [spot for region in regions for spot in _spots(region, threshold, background, config)]
+    spots = [spot for spot in spots if _stands_out(spot, gray, config)]
     columns = np.array([[s.u, s.v, s.radius, s.flux] for s in spots]).reshape(-1, 4)
     unknown = np.full(len(spots), np.nan)
     uv, radius_px, flux = columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy()
@@ -69,12 +70,12 @@ def separating_thresholds(gray: Image, config: ExtractConfig) -> Iterator[tuple[
     histogram = cv2.calcHist([gray], [0], None, [256], [0, 256]).ravel()
     background = int(np.argmax(histogram[:255]))
     floor = background + max(config.min_step, config.contrast * _spread_below(histogram, background))
-    threshold = background
+    threshold = int(np.ceil(floor))
     while threshold < 254:
-        threshold = otsu(histogram, threshold + 1)
-        foreground = histogram[threshold + 1 :].sum() / gray.size
-        if threshold >= floor and foreground <= config.max_foreground:
+        if histogram[threshold + 1 :].sum() <= config.max_foreground * gray.size:
             yield background, threshold
+        above = otsu(histogram, threshold + 1)  # parts the brightest cores; dim lights lie in the interval below
+        threshold = otsu(histogram[: above + 1], threshold + 1)
     yield background, 254
 
 
@@ -135,9 +136,7 @@ def _spots(region: _Region, threshold: int, background: int, config: ExtractConf
         inside = piece.gray[piece.mask > 0]
         peak = int(inside.max())
         half = background + 0.5 * (peak - background)
-        higher = threshold
-        if threshold < half and inside.size > config.min_area_px:
-            higher = min(otsu(np.bincount(inside, minlength=256), threshold + 1), int(half))
+        higher = _next_level(inside, threshold, int(half), config)
         if higher > threshold:
             _, binary = cv2.threshold(cv2.bitwise_and(piece.gray, piece.mask), higher, 255, cv2.THRESH_BINARY)
             for part in _components(piece.gray, np.asarray(binary, np.uint8), piece.offset):
@@ -146,6 +145,19 @@ def _spots(region: _Region, threshold: int, background: int, config: ExtractConf
         spot = _measure(piece, background, config)
         if spot is not None:
             yield spot
+
+
+def _next_level(inside: Image, threshold: int, half: int, config: ExtractConfig) -> int:
+    """The region's own Otsu level while it lies under half height or parts two clear classes; else the same threshold."""
+    higher = otsu(np.bincount(inside, minlength=256), threshold + 1)
+    core = inside > higher
+    if np.count_nonzero(core) < config.min_area_px:
+        return threshold
+    if threshold < half:
+        return min(higher, half)
+    rim = inside[~core]
+    apart = float(inside[core].mean()) - float(rim.mean())
+    return higher if apart > config.class_gap * max(float(rim.std()), 1.0) else threshold
 
 
 def _opened(region: _Region, config: ExtractConfig) -> Iterator[_Region]:
@@ -180,6 +192,19 @@ def _measure(piece: _Region, background: int, config: ExtractConfig) -> _Spot | 
     if radius > config.max_radius_px:
         return None
     return _Spot(center[0] + piece.offset[0], center[1] + piece.offset[1], float(np.sqrt(area / np.pi)), flux)
+
+
+def _stands_out(spot: _Spot, gray: Image, config: ExtractConfig) -> bool:
+    """Whether a small spot's peak clears the noise of the ring around it; large ones were judged by their shape."""
+    if np.pi * spot.radius**2 >= config.small_area_px:
+        return True
+    u, v, reach = round(spot.u), round(spot.v), int(1.5 * spot.radius) + 4
+    window = gray[max(v - reach, 0) : v + reach + 1, max(u - reach, 0) : u + reach + 1].astype(float)
+    rows, columns = np.indices(window.shape)
+    distance = np.hypot(columns + max(u - reach, 0) - spot.u, rows + max(v - reach, 0) - spot.v)
+    core, ring = window[distance <= max(spot.radius, 1.0)], window[distance > spot.radius + 2.0]
+    noise = max(float(np.subtract(*np.percentile(ring, [75, 25]))) / 1.35, 1.0)
+    return float(core.max() - np.median(ring)) > config.contrast * noise
 
 
 def _centroid(weights: Array) -> Array:

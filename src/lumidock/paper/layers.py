@@ -26,15 +26,16 @@ def label_by_color(frame: Frame, detections: Detections, config: LayersConfig) -
 
 
 def _blue_share(image: Image, center: Array, radius: float, config: LayersConfig) -> float:
-    """Share of the pixels between 0.8 and 1.6 radii (at least a 3 x 3 patch) that lie in the blue range of HSV."""
-    reach = max(1.6 * radius, 1.5)
+    """Share of the pixels between 0.8 and 1.6 radii (within the radius, for small spots) in the blue range of HSV."""
+    small = radius < 3.0
+    reach = max(radius, 1.0) if small else 1.6 * radius
     (u0, v0), (u1, v1) = np.floor(center - reach).astype(int), np.ceil(center + reach).astype(int) + 1
     u0, v0 = max(u0, 0), max(v0, 0)
     window = image[v0:v1, u0:u1]
     hue, saturation, value = cv2.split(cv2.cvtColor(window, cv2.COLOR_BGR2HSV))
     rows, columns = np.ogrid[v0 : v0 + window.shape[0], u0 : u0 + window.shape[1]]
     distance = np.hypot(columns - center[0], rows - center[1])
-    ring = (distance <= reach) & ((distance >= 0.8 * radius) | (radius < 3.0)) & (value >= config.min_value)
+    ring = (distance <= reach) & ((distance >= 0.8 * radius) | small) & (value >= config.min_value)
     low, high = config.blue_hue
     blue = ring & (hue >= low) & (hue <= high) & (saturation >= config.min_saturation)
     return float(blue.sum() / max(int(ring.sum()), 1))

@@ -89,6 +89,26 @@ def expose(scenario: Scenario, seen: Lamps, camera: Camera) -> Array:
     return mosaic
 
 
+def with_strays(seen: Lamps, strays: Array) -> Lamps:
+    """The lamps with others at pixels `strays` (S, 2) added, as bright as the station's brightest, which need not be in
+    view."""
+    if not len(strays):
+        return seen
+    like = int(np.argmax(seen.direct_e.sum(axis=1)))
+
+    def grown(values: Array) -> Array:
+        return np.concatenate([values, np.repeat(values[like : like + 1], len(strays), axis=0)])
+
+    return Lamps(
+        np.concatenate([seen.uv, strays]),
+        grown(seen.direct_e),
+        grown(seen.halo_e),
+        grown(seen.window_px),
+        grown(seen.halo_px),
+        np.concatenate([seen.lit, np.ones(len(strays), bool)]),
+    )
+
+
 # channel (B, G, R = 0, 1, 2), first row and first column of each plane of an RGGB mosaic
 _MOSAIC = ((2, 0, 0), (1, 0, 1), (1, 1, 0), (0, 1, 1))
 

@@ -18,11 +18,12 @@ from lumidock.station import Station
 @dataclass(frozen=True, slots=True, eq=False)
 class SpotFrame:
     """One frame's detections and truth: pose `T_dock_cam` (4, 4), the light behind each detection `light` (N,), -1 for a
-    spurious one, and which lights `in_view` (M,) the camera could see before any were taken away."""
+    spurious one, the true pixels `uv` (M, 2) of all lights, and which of them are `in_view` (M,) before any go dark."""
 
     detections: Detections
     T_dock_cam: Array
     light: Indices
+    uv: Array
     in_view: np.ndarray
 
 
@@ -72,7 +73,7 @@ def _spot_frame(
     rear = (light >= 0) & ~is_front[light]
     rear ^= rng.random(len(light)) < scenario.spots.wrong_layer
     detections = Detections.from_uv(name, t_ns, seen, p_rear=np.where(rear, 0.95, 0.05))
-    return SpotFrame(detections, T_dock_cam, light, visible)
+    return SpotFrame(detections, T_dock_cam, light, uv, visible)
 
 
 def dark_lights(scenario: Scenario, front_in_view: Indices, rng: np.random.Generator) -> Indices:

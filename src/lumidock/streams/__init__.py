@@ -1,1 +1,1 @@
-
+"""Frames in, fixes out: a file per format."""

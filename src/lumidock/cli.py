@@ -1,0 +1,272 @@
+"""The command line: the only place that prints, parses options and exits."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from importlib.resources import files
+from itertools import count
+from pathlib import Path
+from typing import Annotated, Any
+
+import click
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from lumidock.camera import load_camera
+from lumidock.config import Config, load_config
+from lumidock.datatypes import Fix
+from lumidock.errors import InputError, LumidockError
+from lumidock.station import load_station
+from lumidock.streams.sources import Item, Source, open_source
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+_DEFAULT_STATION, _DEFAULT_CAMERA = "cage-2x2x5", "imx264-60deg"
+
+Out = Annotated[Path, typer.Option("--out", help="Folder to write; refused when it exists, unless --force.")]
+Force = Annotated[bool, typer.Option("--force", help="Write into an existing folder, replacing earlier results.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
+StationOption = Annotated[str | None, typer.Option("--station", help="Station file, or the name of a shipped one.")]
+CameraOption = Annotated[str | None, typer.Option("--camera", help="camera_info file, or the name of a shipped one.")]
+
+
+def main() -> None:
+    """Entry point: every error that is the user's to mend is one line and exit code 2."""
+    try:
+        app(standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        print(error.format_message())
+        sys.exit(2)
+    except click.ClickException as error:
+        _fail(error.format_message())
+    except (click.exceptions.Abort, KeyboardInterrupt):
+        sys.exit(130)
+    except LumidockError as error:
+        _fail(str(error))
+    except OSError as error:
+        _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
+
+
+def _fail(text: str) -> None:
+    print(f"lumidock: {' '.join(text.split())}", file=sys.stderr)
+    sys.exit(2)
+
+
+@app.callback(invoke_without_command=True)
+def _lumidock(
+    show_version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    """Where a vehicle is relative to its dock, from one camera and the dock's guiding lights."""
+    if show_version:
+        print(version("lumidock"))
+
+
+@app.command("run")
+def _run(
+    source: Annotated[Path, typer.Argument(help="Sequence folder, image folder (with --fps) or video file.")],
+    out: Out,
+    station: StationOption = None,
+    camera: CameraOption = None,
+    method: Annotated[str, typer.Option(help="paper")] = "paper",
+    cold: Annotated[bool, typer.Option("--cold", help="Forget all history before each frame.")] = False,
+    fps: Annotated[float | None, typer.Option(help="Frame rate, for sources without time stamps.")] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML file of settings that differ from the defaults.")] = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Find the pose of the camera in the dock frame in every frame of SOURCE."""
+    from lumidock.paper import PaperLocalizer
+    from lumidock.run import Setup
+    from lumidock.run import run as run_source
+    from lumidock.streams.runfolder import RunFolder
+
+    if method != "paper":
+        raise InputError(f"--method {method}: there is paper")
+    if fps is not None and not 0.0 < fps < 1e6:
+        raise InputError(f"--fps {fps:g}: wanted a positive frame rate")
+    opened = open_source(source, fps)
+    station_file = _file("station", station, opened.station, opened)
+    camera_file = _file("camera", camera, opened.camera, opened)
+    settings = load_config(config) if config else Config()
+    dock = load_station(station_file)
+    localizer = PaperLocalizer(dock, load_camera(camera_file), settings.paper, cold=cold)
+    _prepare(out, force)
+    setup = Setup(method, cold, settings, station_file, camera_file)
+    with RunFolder(out, dock.ids) as folder, _progress("run") as progress:
+        _copy(station_file, out / "station.yaml")
+        _copy(camera_file, out / "camera.yaml")
+        done = count(1)
+        summary = run_source(opened, localizer, folder, setup, on_fix=lambda _item, _fix: progress(next(done), opened.count))
+    counts = summary.as_dict()
+    if as_json:
+        print(json.dumps(counts, indent=2))
+        return
+    print(f"{counts['valid']} fixes in {counts['frames']} frames; written to {out}")
+    if counts["reason"]:
+        print("no fix: " + ", ".join(f"{word} {count}" for word, count in sorted(counts["reason"].items())))
+
+
+@app.command("sim")
+def _sim(
+    scenario: Annotated[str, typer.Argument(help="A shipped scenario (approach, trials, rectangle) or a .yaml file.")],
+    out: Out,
+    seed: Annotated[int, typer.Option(min=0, help="Everything random follows from it.")] = 0,
+    settings: Annotated[list[str] | None, typer.Option("--set", help="key.subkey=value; may be repeated.")] = None,
+    detections: Annotated[bool, typer.Option("--detections", help="Bare detections, without rendering.")] = False,
+    station: StationOption = None,
+    camera: CameraOption = None,
+    force: Force = False,
+) -> None:
+    """Simulate SCENARIO into a sequence folder with truth."""
+    from lumidock.sim.scenario import load_scenario
+    from lumidock.sim.sequence import write_detections, write_rendered
+
+    loaded = load_scenario(scenario, tuple(settings or ()))
+    station_file = _shipped_or_path("station", station or _DEFAULT_STATION)
+    dock = load_station(station_file)
+    lens = load_camera(_shipped_or_path("camera", camera or _DEFAULT_CAMERA))
+    _prepare(out, force, remove=("frames", "detections.csv"))
+    _copy(station_file, out / "station.yaml")
+    if detections:
+        frames = write_detections(loaded, dock, lens, seed, out)
+    else:
+        with _progress("sim") as progress:
+            frames = write_rendered(loaded, dock, lens, seed, out, progress=progress)
+    print(f"{frames} frames written to {out}")
+
+
+@app.command("eval")
+def _eval(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
+    truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="Simulated sequence folder, or a truth.csv.")],
+    as_json: AsJson = False,
+) -> None:
+    """Compare a run with the truth."""
+    from lumidock.metrics import evaluate
+
+    result = evaluate(run, truth)
+    if as_json:
+        print(json.dumps(result, indent=2))
+    else:
+        _print_evaluation(result)
+
+
+@app.command("demo")
+def _demo(
+    out: Out = Path("demo-out"),
+    seed: Annotated[int, typer.Option(min=0, help="Everything random follows from it.")] = 0,
+    force: Force = False,
+) -> None:
+    """Simulate a docking, run it, and leave files and pictures to look at."""
+    from lumidock.demo import Album, summary_lines
+    from lumidock.metrics import evaluate, true_poses
+    from lumidock.paper import PaperLocalizer
+    from lumidock.report import contact_sheet, plot_trajectory
+    from lumidock.run import Setup
+    from lumidock.run import run as run_source
+    from lumidock.sim.scenario import load_scenario
+    from lumidock.sim.sequence import write_rendered
+    from lumidock.streams.runfolder import RunFolder
+
+    _prepare(out, force)
+    sequence, run_folder = out / "sequence", out / "run"
+    _prepare(sequence, True, remove=("frames",))
+    scenario = load_scenario("approach")
+    station_file, camera_file = _shipped_or_path("station", _DEFAULT_STATION), _shipped_or_path("camera", _DEFAULT_CAMERA)
+    dock, lens = load_station(station_file), load_camera(camera_file)
+    _copy(station_file, sequence / "station.yaml")
+    with _progress("simulating") as progress:
+        write_rendered(scenario, dock, lens, seed, sequence, progress=progress)
+    source = open_source(sequence)
+    setup = Setup("paper", False, Config(), station_file, camera_file)
+    video = out / "annotated.mp4"
+    with (
+        RunFolder(run_folder, dock.ids) as folder,
+        _progress("localizing") as progress,
+        Album(dock, lens, video, 1.0 / scenario.path.frame_interval_s) as album,
+    ):
+
+        def on_fix(item: Item, fix: Fix) -> None:
+            album.add(item, fix)
+            progress(len(album.fixes), source.count)
+
+        _copy(station_file, run_folder / "station.yaml")
+        _copy(camera_file, run_folder / "camera.yaml")
+        summary = run_source(source, PaperLocalizer(dock, lens), folder, setup, on_fix=on_fix)
+    result = evaluate(run_folder, sequence)
+    plot_trajectory(album.fixes, true_poses(sequence), dock, out / "trajectory.png")
+    contact_sheet(album.sheet(), out / "stages.png")
+    print("\n".join(summary_lines(result, summary.as_dict())))
+    print(f"look at     {out / 'trajectory.png'}, {out / 'stages.png'}, {video}, {run_folder / 'fixes.csv'}")
+
+
+def _file(kind: str, given: str | None, beside: Path | None, source: Source) -> Path:
+    """The station or camera file: the option, or the one beside the frames."""
+    if given is not None:
+        return _shipped_or_path(kind, given)
+    if beside is None:
+        raise InputError(f"{source.path}: no {kind}.yaml beside the frames; give --{kind} FILE")
+    return beside
+
+
+def _shipped_or_path(kind: str, name: str) -> Path:
+    """A file, or what the package ships under that name."""
+    shipped = Path(str(files("lumidock"))) / f"{kind}s" / f"{name}.yaml"
+    return shipped if "/" not in name and shipped.exists() else Path(name)
+
+
+def _copy(source: Path, target: Path) -> None:
+    if source.resolve() != target.resolve():
+        shutil.copyfile(source, target)
+
+
+def _prepare(folder: Path, force: bool, *, remove: tuple[str, ...] = ()) -> None:
+    """Make an output folder; an existing one only with `force`, cleared of the entries that would mislead."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file")
+    if folder.exists() and not force:
+        raise InputError(f"{folder}: exists; give --force to write into it")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in remove:
+        stale = folder / name
+        if stale.is_dir():
+            shutil.rmtree(stale)
+        else:
+            stale.unlink(missing_ok=True)
+
+
+@contextmanager
+def _progress(title: str) -> Iterator[Callable[[int, int | None], None]]:
+    """A bar with ETA on standard error, for a person only; yields a callback (done, total)."""
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(TextColumn("{task.description}"), *columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(title, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _print_evaluation(result: dict[str, Any]) -> None:
+    """The evaluation as text: one line a topic, one row a range."""
+    print(f"valid {result['valid']} of {result['frames']} frames; no fix: {result['reasons'] or 'none'}")
+    if result["longest_gap_s"] is not None:
+        print(f"longest gap between fixes {result['longest_gap_s']:.2f} s")
+    if result["error"]:
+        print(f"{'z, m':>12} {'frames':>7} {'valid':>6}   lateral m       axial m         angle deg   (median / 95 %)")
+        for row in [*result["by_true_z"], {"z_m": None, **result, **result["error"]}]:
+            where = "all" if row["z_m"] is None else f"{row['z_m'][0]:g}..{row['z_m'][1]:g}"
+            errors = (row.get(name) for name in ("lateral_m", "axial_m", "angle_deg"))
+            cells = "  ".join(f"{e['median']:6.3f} /{e['p95']:7.3f}" if e else f"{'-':>15}" for e in errors)
+            print(f"{where:>12} {row['frames']:7d} {row['valid']:6d}   {cells}")
+    for layer, content in result.get("layers", {}).items():
+        if isinstance(content, dict):
+            print(f"{layer}: {content['fixes']} fixes, z {content['first_z_m']:.2f} to {content['last_z_m']:.2f} m")
+        elif content is not None:
+            print(f"largest offset between the layers {content:.3f} m")
+    if "labels" in result:
+        print(f"names: {result['labels']['named']} given, {result['labels']['wrong']} wrong")

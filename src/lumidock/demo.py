@@ -1,0 +1,83 @@
+"""The main job in one go: a simulated docking, the run, its evaluation and the pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import cv2
+import numpy as np
+
+from lumidock.camera import Camera
+from lumidock.datatypes import Fix, Frame, Image
+from lumidock.overlay import draw
+from lumidock.station import Station
+from lumidock.streams.sources import Item
+
+_WIDTH = 1224
+_PICTURE_OF_STAGE = 20  # the sheet shows this frame of each stage, or the last before it
+_SHEET_STAGES = ("search", "front", "transition", "rear")
+
+
+@dataclass(slots=True)
+class Album:
+    """Turns every fix into an annotated video frame and keeps one picture of each stage; a context manager."""
+
+    station: Station
+    camera: Camera
+    video: Path
+    fps: float
+    fixes: list[Fix] = field(default_factory=list)
+    by_stage: dict[str, Image] = field(default_factory=dict)
+    _writer: cv2.VideoWriter | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._writer is not None:
+            self._writer.release()
+
+    def add(self, item: Item, fix: Fix) -> None:
+        """Draw one fix."""
+        self.fixes.append(fix)
+        if not isinstance(item, Frame):
+            return
+        picture = draw(item.image, fix, self.station, self.camera, width=_WIDTH)
+        if self._writer is None:
+            codec = cv2.VideoWriter.fourcc(*"mp4v")
+            self._writer = cv2.VideoWriter(str(self.video), codec, self.fps, (picture.shape[1], picture.shape[0]))
+        self._writer.write(picture)
+        if fix.valid and sum(f.stage == fix.stage for f in self.fixes) <= _PICTURE_OF_STAGE:
+            self.by_stage[fix.stage] = picture
+
+    def sheet(self) -> list[Image]:
+        """One picture per stage, in the order of the approach; an even number of them."""
+        pictures = [self.by_stage[stage] for stage in _SHEET_STAGES if stage in self.by_stage]
+        return pictures[len(pictures) % 2 :]
+
+
+def summary_lines(result: dict[str, Any], counts: dict[str, Any]) -> list[str]:
+    """Five lines about a run against its truth."""
+    error, layers, labels = result["error"], result.get("layers", {}), result.get("labels", {})
+    front, rear = layers.get("front", {}), layers.get("rear", {})
+
+    def reach(layer: dict[str, Any]) -> str:
+        return f"{layer['first_z_m']:.2f} m to {layer['last_z_m']:.2f} m" if layer else "none"
+
+    gap = result["longest_gap_s"]
+    latency = counts["latency_us"].get("p50", np.nan) / 1000.0
+    return [
+        f"fixes       {result['valid']} of {result['frames']} frames, longest gap {gap:.2f} s" if gap else "fixes       none",
+        f"front layer {reach(front)}",
+        f"rear layer  {reach(rear)}",
+        f"error       median {error['lateral_m']['median']:.3f} m lateral, {error['axial_m']['median']:.3f} m axial, "
+        f"{error['angle_deg']['median']:.2f} deg; wrong names {labels.get('wrong', 0)} of {labels.get('named', 0)}"
+        if error
+        else "error       none",
+        f"time        {latency:.0f} ms a frame (median, decoding excluded)",
+    ]

@@ -1,0 +1,65 @@
+"""Pictures of a run: the trajectory against the truth, and a sheet of annotated frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lumidock.datatypes import Array, Fix, Image
+from lumidock.errors import LumidockError
+from lumidock.station import Station
+
+_STAGE_COLORS = {"search": "#7f7f7f", "front": "#d9860a", "transition": "#2a9d5c", "rear": "#2f6fd0"}
+
+
+def plot_trajectory(fixes: Sequence[Fix], truth: dict[str, Array], station: Station, out: Path) -> None:
+    """Top view, side view and errors of a run against the true poses `T_dock_cam` by frame name; writes a PNG.
+
+    Raises: LumidockError when matplotlib is not installed (extra `report`).
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError:
+        raise LumidockError("plots need matplotlib: pip install 'lumidock[report]'") from None
+    figure = Figure(figsize=(11, 8.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    top, side, error = figure.subplots(3, 1, sharex=True, height_ratios=[1, 1, 1.1])
+    true = np.array([T[:3, 3] for T in truth.values()])
+    for axes, column, label in ((top, 0, "x, m (right)"), (side, 1, "y, m (up)")):
+        axes.plot(true[:, 2], true[:, column], color="black", linewidth=1, label="truth")
+        axes.scatter(station.p_dock[:, 2], station.p_dock[:, column], marker="*", s=40, color="#c9a400", label="lights")
+        _scatter_by_stage(axes, fixes, lambda fix, c=column: fix.T_dock_cam[c, 3])
+        reach = 1.3 * max(1.0, float(np.abs(true[:, column]).max()))
+        axes.set_ylim(-reach, reach)
+        axes.set_ylabel(label)
+    _scatter_by_stage(error, fixes, lambda fix: float(np.linalg.norm((fix.T_dock_cam - truth[fix.frame])[:3, 3])))
+    error.set_yscale("log")
+    error.set_ylabel("position error, m")
+    error.set_xlabel("z, m: distance before the entrance plane; the cage is 0 to -5 m")
+    error.set_xlim(float(true[:, 2].max()) + 1.0, float(station.p_dock[:, 2].min()) - 1.0)
+    top.set_title("Camera in the dock frame: from above, from the side, and how far from the truth", loc="left")
+    top.legend(loc="upper right", ncols=3, fontsize=8)
+    for axes in (top, side, error):
+        axes.axvspan(0.0, float(station.p_dock[:, 2].min()), color="#2f6fd0", alpha=0.07)
+        axes.grid(alpha=0.25)
+    figure.savefig(out, dpi=110)
+
+
+def _scatter_by_stage(axes, fixes: Sequence[Fix], value) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001
+    """Points over z, coloured by docking stage."""
+    valid = [fix for fix in fixes if fix.T_dock_cam is not None]
+    for stage, color in _STAGE_COLORS.items():
+        inside = [fix for fix in valid if fix.stage == stage]
+        if inside:
+            z = [fix.T_dock_cam[2, 3] for fix in inside if fix.T_dock_cam is not None]
+            axes.scatter(z, [value(fix) for fix in inside], s=9, color=color, label=f"{stage} stage")
+
+
+def contact_sheet(pictures: Sequence[Image], out: Path, *, columns: int = 2) -> None:
+    """Write pictures (H, W, 3) of one size side by side into one PNG."""
+    rows = [np.hstack(pictures[i : i + columns]) for i in range(0, len(pictures) - columns + 1, columns)]
+    cv2.imwrite(str(out), np.vstack(rows))

@@ -1,0 +1,143 @@
+"""A run: every item of a source through a localizer into a run folder."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from lumidock.config import Config
+from lumidock.datatypes import Detections, Fix, Frame, Unusable
+from lumidock.errors import FrameError, InputError
+from lumidock.streams.runfolder import RunFolder, sha256
+from lumidock.streams.sources import Item, Source
+
+
+class TwoDoors(Protocol):
+    """What every method offers: an image door and a light door."""
+
+    def process(self, frame: Frame) -> Fix:
+        """Fix of one picture. Raises: FrameError for one that does not fit the calibration."""
+        ...
+
+    def process_detections(self, detections: Detections) -> Fix:
+        """Fix of one frame's detections."""
+        ...
+
+
+@dataclass(slots=True)
+class Summary:
+    """Counts of a run, as they stand in run.json."""
+
+    frames: int = 0
+    usable: int = 0
+    valid: int = 0
+    status: Counter[str] = field(default_factory=Counter)
+    stage: Counter[str] = field(default_factory=Counter)
+    reason: Counter[str] = field(default_factory=Counter)
+    latency_us: list[int] = field(default_factory=list)
+    first_error: str = ""
+    finished: bool = False
+
+    def count(self, fix: Fix, latency_us: int | None, error: str) -> None:
+        """Add one frame."""
+        self.frames += 1
+        self.usable += fix.reason not in ("bad_frame", "bad_stamp")
+        self.valid += fix.valid
+        self.status[fix.status] += 1
+        self.stage[fix.stage] += fix.valid
+        self.reason[fix.reason] += bool(fix.reason)
+        self.first_error = self.first_error or error
+        if latency_us is not None:
+            self.latency_us.append(latency_us)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For run.json; latency in microseconds, decoding excluded."""
+        quantiles = {"p50": 50, "p95": 95, "p99": 99, "max": 100}
+        latency = {name: int(np.percentile(self.latency_us, q)) for name, q in quantiles.items() if self.latency_us}
+        return {
+            "frames": self.frames,
+            "usable": self.usable,
+            "valid": self.valid,
+            "status": dict(self.status),
+            "valid_by_stage": {name: count for name, count in self.stage.items() if count},
+            "reason": {name: count for name, count in self.reason.items() if count},
+            "latency_us": latency,
+            "finished": self.finished,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What identifies a run beside its source."""
+
+    method: str
+    cold: bool
+    config: Config
+    station: Path
+    camera: Path
+
+
+def run(
+    source: Source,
+    localizer: TwoDoors,
+    folder: RunFolder,
+    setup: Setup,
+    *,
+    on_fix: Callable[[Item, Fix], None] = lambda item, fix: None,
+) -> Summary:
+    """Process all of a source and describe the run, also when it is interrupted.
+
+    Raises: InputError when not one row could be used.
+    """
+    summary = Summary()
+    folder.describe(_description(source, setup, summary))
+    try:
+        for item in source.items():
+            fix, latency_us, error = _process(localizer, item)
+            folder.add(fix, latency_us, t_ns=item.t_ns)
+            summary.count(fix, latency_us, error)
+            on_fix(item, fix)
+        summary.finished = True
+    finally:
+        folder.describe(_description(source, setup, summary))
+    if not summary.usable:
+        raise InputError(summary.first_error or f"{source.path}: no frame in it")
+    return summary
+
+
+def _process(localizer: TwoDoors, item: Item) -> tuple[Fix, int | None, str]:
+    """Fix of one item, its latency in microseconds, and what was wrong with it."""
+    if isinstance(item, Unusable):
+        return _unusable(item.frame, item.t_ns or 0, item.reason), None, item.text
+    start = time.perf_counter_ns()
+    try:
+        fix = localizer.process(item) if isinstance(item, Frame) else localizer.process_detections(item)
+    except FrameError as error:
+        name = item.name if isinstance(item, Frame) else item.frame
+        return _unusable(name, item.t_ns, error.reason), None, str(error)
+    error_text = f"frame {fix.frame}: stamp {fix.t_ns} does not follow the one before" if fix.reason == "bad_stamp" else ""
+    return fix, (time.perf_counter_ns() - start) // 1000, error_text
+
+
+def _unusable(frame: str, t_ns: int, reason: str) -> Fix:
+    return Fix(frame, t_ns, "none", "search", reason=reason)
+
+
+def _description(source: Source, setup: Setup, summary: Summary) -> dict[str, Any]:
+    inputs = {path.name: sha256(path) for path in (*source.inputs, setup.station, setup.camera)}
+    return {
+        "lumidock": version("lumidock"),
+        "method": setup.method,
+        "cold": setup.cold,
+        "source": {"kind": source.kind, "name": source.path.name},
+        "inputs_sha256": inputs,
+        "config": setup.config.model_dump(mode="json"),
+        "counts": summary.as_dict(),
+    }

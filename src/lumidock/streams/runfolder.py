@@ -1,0 +1,117 @@
+"""The run folder: fixes, lights, layers, trajectory and run.json, complete up to the last row whenever a run is killed."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from lumidock.datatypes import Array, Fix
+from lumidock.geometry import bearing_and_range, quat_xyzw_from_rotation
+
+_COVARIANCE = tuple(f"c{i}{j}" for i in range(6) for j in range(i, 6))
+_PROTECTION = ("pl_lateral_m", "pl_axial_m", "pl_angle_rad")
+FIX_COLUMNS = (
+    *("frame", "t_ns", "valid", "guide", "status", "stage", "n_seen", "n_used"),
+    *("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
+    *_COVARIANCE,
+    *_PROTECTION,
+    *("bearing_x_rad", "bearing_y_rad", "range_m", "pl_bearing_rad", "pl_range_m", "reason", "latency_us"),
+)
+LIGHT_COLUMNS = ("frame", "u_px", "v_px", "radius_px", "flux", "p_light", "p_rear", "light")
+LAYER_COLUMNS = ("frame", "layer", "n_used", "matched_by", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+_FILES = ("fixes.csv", "lights.csv", "layers.csv", "trajectory.tum", "run.json")
+
+
+class RunFolder:
+    """Writes a run, each frame's rows in one piece; use as a context manager."""
+
+    def __init__(self, folder: Path, light_ids: tuple[str, ...]) -> None:
+        """Start the run's files in `folder`, replacing those of an earlier run."""
+        self.folder, self.light_ids = folder, light_ids
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in _FILES:
+            (folder / name).unlink(missing_ok=True)
+        # unbuffered: a row is in the file, whole, or it is not
+        self._files = {name: (folder / name).open("wb", buffering=0) for name in _FILES[:4]}
+        self._write("fixes.csv", [FIX_COLUMNS])
+        self._write("lights.csv", [LIGHT_COLUMNS])
+        self._write("layers.csv", [LAYER_COLUMNS])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for file in self._files.values():
+            file.close()
+
+    def add(self, fix: Fix, latency_us: int | None, *, t_ns: int | None) -> None:
+        """Append one frame; `t_ns` is None, and its field empty, when the stamp could not be read."""
+        self._write("fixes.csv", [_fix_row(fix, latency_us, t_ns)])
+        self._write("lights.csv", self._light_rows(fix))
+        self._write(
+            "layers.csv", ([fix.frame, p.layer, p.n_used, p.source, *_pose_fields(p.T_dock_cam)] for p in fix.by_layer)
+        )
+        if fix.T_dock_cam is not None:
+            line = " ".join([_seconds(fix.t_ns), *_pose_fields(fix.T_dock_cam)])
+            self._files["trajectory.tum"].write(line.encode() + b"\n")
+
+    def describe(self, content: dict[str, Any]) -> None:
+        """Write run.json, all of it or none."""
+        temporary = self.folder / "run.json.part"
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        os.replace(temporary, self.folder / "run.json")
+
+    def _write(self, name: str, rows: Iterable[Iterable[object]]) -> None:
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows(rows)
+        if text.tell():
+            self._files[name].write(text.getvalue().encode("utf-8"))
+
+    def _light_rows(self, fix: Fix) -> Iterable[list[object]]:
+        if fix.match is None:
+            return
+        d = fix.match.detections
+        for i, light in enumerate(fix.match.light):
+            numbers = (*d.uv[i], d.radius_px[i], d.flux[i], d.p_light[i], d.p_rear[i])
+            yield [fix.frame, *map(_number, numbers), self.light_ids[light] if light >= 0 else ""]
+
+
+def _fix_row(fix: Fix, latency_us: int | None, t_ns: int | None) -> list[object]:
+    head = [fix.frame, "" if t_ns is None else t_ns, int(fix.valid), 0, fix.status, fix.stage, fix.n_seen, fix.n_used]
+    pose, bearing = [""] * 7, [""] * 3
+    if fix.T_dock_cam is not None:
+        pose = _pose_fields(fix.T_dock_cam)
+        bearing = [f"{value:.9f}" for value in bearing_and_range(fix.T_dock_cam)]
+    unknown = [""] * (len(_COVARIANCE) + len(_PROTECTION))
+    return [*head, *pose, *unknown, *bearing, "", "", fix.reason, "" if latency_us is None else latency_us]
+
+
+def _pose_fields(T_dock_cam: Array) -> list[str]:
+    return [f"{value:.9f}" for value in (*T_dock_cam[:3, 3], *quat_xyzw_from_rotation(T_dock_cam[:3, :3]))]
+
+
+def _number(value: float) -> str:
+    return f"{value:.4f}" if np.isfinite(value) else ""
+
+
+def _seconds(t_ns: int) -> str:
+    """Seconds with nine decimals, exactly."""
+    whole, part = divmod(abs(t_ns), 10**9)
+    return f"{'-' if t_ns < 0 else ''}{whole}.{part:09d}"
+
+
+def sha256(path: Path) -> str:
+    """Hash of a file's content, for run.json."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
