@@ -17,7 +17,7 @@ from lumidock.station import Station
 from lumidock.streams.sources import Item
 
 _WIDTH = 1224
-_PICTURE_OF_STAGE = 20  # the sheet shows this frame of each stage, or the last before it
+_PICTURE_OF_STAGE = 20  # the sheet shows this fix of each stage, or the last before it
 _SHEET_STAGES = ("search", "front", "transition", "rear")
 
 
@@ -52,7 +52,7 @@ class Album:
             codec = cv2.VideoWriter.fourcc(*"mp4v")
             self._writer = cv2.VideoWriter(str(self.video), codec, self.fps, (picture.shape[1], picture.shape[0]))
         self._writer.write(picture)
-        if fix.valid and sum(f.stage == fix.stage for f in self.fixes) <= _PICTURE_OF_STAGE:
+        if fix.valid and sum(f.valid and f.stage == fix.stage for f in self.fixes) <= _PICTURE_OF_STAGE:
             self.by_stage[fix.stage] = picture
 
     def sheet(self) -> list[Image]:

@@ -108,9 +108,9 @@ def _left_jacobian_q(rho: Array, w: Array) -> Array:
     WPW = W @ PW
     if angle < 0.05:  # the closed form cancels catastrophically here
         a2 = angle * angle
-        b = 1.0 / 6.0 - a2 / 120.0
-        c = 1.0 / 24.0 - a2 / 720.0
-        d = 1.0 / 120.0 - a2 / 2520.0
+        b = 1.0 / 6.0 - a2 / 120.0 + a2 * a2 / 5040.0
+        c = 1.0 / 24.0 - a2 / 720.0 + a2 * a2 / 40320.0
+        d = 1.0 / 120.0 - a2 / 2520.0 + a2 * a2 / 120960.0
     else:
         s, k = math.sin(angle), math.cos(angle)
         b = (angle - s) / angle**3

@@ -29,11 +29,19 @@ class _Spot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Region:
-    """A connected region: the window of the gray image it lies in, the window's offset and the region's mask."""
+    """A connected region: the window of the gray image it lies in, the region's mask, the window's offset (u, v) and the
+    size (width, height) of the whole image."""
 
     gray: Image
     mask: Image
     offset: tuple[int, int]
+    size: tuple[int, int]
+
+    @property
+    def cut_by_edge(self) -> bool:
+        """Whether the region runs out of the picture."""
+        (u, v), (height, width) = self.offset, self.mask.shape
+        return u == 0 or v == 0 or u + width == self.size[0] or v + height == self.size[1]
 
 
 def lights(frame: Frame, config: ExtractConfig) -> Detections:
@@ -117,34 +125,34 @@ def _connected_regions(gray: Image, binary: Image, outlines: list[Array]) -> Ite
         u, v, width, height = cv2.boundingRect(outline)
         window = np.s_[v : v + height, u : u + width]
         inside = cv2.drawContours(np.zeros((height, width), np.uint8), [outline], -1, 255, cv2.FILLED, offset=(-u, -v))
-        yield from _components(gray[window], cv2.bitwise_and(binary[window], inside), (u, v))
+        lit = np.asarray(cv2.bitwise_and(binary[window], inside), np.uint8)
+        yield from _components(gray[window], lit, (u, v), (gray.shape[1], gray.shape[0]))
 
 
-def _components(gray: Image, binary: Image, offset: tuple[int, int]) -> Iterator[_Region]:
+def _components(
+    gray: Image, binary: Image, offset: tuple[int, int], size: tuple[int, int]
+) -> Iterator[_Region]:
     """Connected components of a binary window, each in a window of its own."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(binary, connectivity=8)
     for label in range(1, count):
         u, v, width, height = (int(x) for x in stats[label, :4])
         window = np.s_[v : v + height, u : u + width]
         mask = np.asarray((labels[window] == label) * np.uint8(255))
-        yield _Region(gray[window], mask, (offset[0] + u, offset[1] + v))
+        yield _Region(gray[window], mask, (offset[0] + u, offset[1] + v), size)
 
 
 def _spots(region: _Region, threshold: int, background: int, config: ExtractConfig) -> Iterator[_Spot]:
-    """Lights in a region: opened, cut at its own Otsu level until each piece stands at half height, then judged."""
-    for piece in _opened(region, config):
-        inside = piece.gray[piece.mask > 0]
-        peak = int(inside.max())
-        half = background + 0.5 * (peak - background)
-        higher = _next_level(inside, threshold, int(half), config)
-        if higher > threshold:
-            _, binary = cv2.threshold(cv2.bitwise_and(piece.gray, piece.mask), higher, 255, cv2.THRESH_BINARY)
-            for part in _components(piece.gray, np.asarray(binary, np.uint8), piece.offset):
-                yield from _spots(part, higher, background, config)
-            continue
-        spot = _measure(piece, background, config)
-        if spot is not None:
-            yield spot
+    """Lights in a region: cut at its own Otsu level until each part stands at half height, then opened and judged."""
+    inside = region.gray[region.mask > 0]
+    half = background + (int(inside.max()) - background) // 2
+    higher = _next_level(inside, threshold, half, config)
+    if higher > threshold:
+        _, binary = cv2.threshold(cv2.bitwise_and(region.gray, region.mask), higher, 255, cv2.THRESH_BINARY)
+        for part in _components(region.gray, np.asarray(binary, np.uint8), region.offset, region.size):
+            yield from _spots(part, higher, background, config)
+        return
+    measured = (_measure(piece, background, config) for piece in _opened(region, config))
+    yield from (spot for spot in measured if spot is not None)
 
 
 def _next_level(inside: Image, threshold: int, half: int, config: ExtractConfig) -> int:
@@ -156,6 +164,8 @@ def _next_level(inside: Image, threshold: int, half: int, config: ExtractConfig)
     if threshold < half:
         return min(higher, half)
     rim = inside[~core]
+    if not rim.size:
+        return threshold
     apart = float(inside[core].mean()) - float(rim.mean())
     return higher if apart > config.class_gap * max(float(rim.std()), 1.0) else threshold
 
@@ -164,34 +174,46 @@ def _opened(region: _Region, config: ExtractConfig) -> Iterator[_Region]:
     """Morphological opening with a radius from the distance transform: cuts the bridges where halos touch."""
     depth = cv2.distanceTransform(cv2.copyMakeBorder(region.mask, 1, 1, 1, 1, cv2.BORDER_CONSTANT), cv2.DIST_L2, 3)
     radius = int(config.opening * float(depth.max()))
-    if radius < 1:
+    if radius < 1 or region.cut_by_edge:  # at the picture's edge opening would round off what the edge cut straight
         yield region
         return
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     padded = cv2.copyMakeBorder(region.mask, radius, radius, radius, radius, cv2.BORDER_CONSTANT)
     opened = cv2.morphologyEx(padded, cv2.MORPH_OPEN, kernel)[radius:-radius, radius:-radius]
-    yield from _components(region.gray, np.asarray(opened, np.uint8), region.offset)
+    yield from _components(region.gray, np.asarray(opened, np.uint8), region.offset, region.size)
 
 
 def _measure(piece: _Region, background: int, config: ExtractConfig) -> _Spot | None:
     """Circle, roundness and compactness of a piece; None when it is no light."""
     contours, _ = cv2.findContours(piece.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    outline = max(contours, key=len)[:, 0, :].astype(float)
+    outline = max(contours, key=len)[:, 0, :] + np.array(piece.offset, float)
     area = float(np.count_nonzero(piece.mask))
     if area < config.min_area_px or len(outline) < 3:
         return None
     weights = np.where(piece.mask > 0, piece.gray.astype(float) - background, 0.0)
-    flux = float(weights.sum())
     if area < config.small_area_px:
-        center = _centroid(weights)
-        radius = np.sqrt(area / np.pi)
+        center, radius = _centroid(weights) + piece.offset, float(np.sqrt(area / np.pi))
+    elif piece.cut_by_edge:
+        center, radius, round_ = _fit_arc(outline, piece.size, config)
     else:
         center, radius = fit_circle(outline)
-        if not _is_round(outline, area, radius, config):
-            return None
-    if radius > config.max_radius_px:
+        round_ = _is_round(outline, area, radius, config)
+    if radius > config.max_radius_px or not (area < config.small_area_px or round_):
         return None
-    return _Spot(center[0] + piece.offset[0], center[1] + piece.offset[1], float(np.sqrt(area / np.pi)), flux)
+    equal_area = radius if piece.cut_by_edge else float(np.sqrt(area / np.pi))
+    return _Spot(float(center[0]), float(center[1]), equal_area, float(weights.sum()))
+
+
+def _fit_arc(outline: Array, size: tuple[int, int], config: ExtractConfig) -> tuple[Array, float, bool]:
+    """Circle through the part of an outline (N, 2) inside the picture, and whether that is an arc around a visible
+    centre."""
+    last = np.array(size) - 1.0
+    arc = outline[((outline > 0) & (outline < last)).all(axis=1)]
+    if len(arc) < 8:
+        return np.zeros(2), 0.0, False
+    center, radius = fit_circle(arc)
+    off = np.hypot(*(arc - center).T) - radius
+    return center, radius, bool((center > 0).all() and (center < last).all() and off.std() < config.max_arc_error * radius)
 
 
 def _stands_out(spot: _Spot, gray: Image, config: ExtractConfig) -> bool:
