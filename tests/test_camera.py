@@ -35,15 +35,11 @@ def camera(request):
 
 def ray(polar, azimuth):
     """Unit rays (N, 3) at the angle `polar` off the optical axis."""
-    return np.stack(
-        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1
-    )
+    return np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
 
 
 def hemisphere_and_more(polar_step_deg=0.25, azimuth_step_deg=5.0):
-    polar, azimuth = np.meshgrid(
-        np.arange(0.0, 180.0, polar_step_deg), np.arange(0.0, 360.0, azimuth_step_deg)
-    )
+    polar, azimuth = np.meshgrid(np.arange(0.0, 180.0, polar_step_deg), np.arange(0.0, 360.0, azimuth_step_deg))
     return ray(np.deg2rad(polar.ravel()), np.deg2rad(azimuth.ravel()))
 
 
@@ -113,9 +109,7 @@ def test_no_lens_shows_one_pixel_two_rays(numerator, denominator):
 
 def test_projection_forgets_the_distance(camera, rng):
     p_cam = points_in_the_image(camera, rng)
-    assert_close(
-        camera.project(p_cam), camera.project(p_cam * rng.uniform(0.01, 100, (len(p_cam), 1))), atol=1e-9
-    )
+    assert_close(camera.project(p_cam), camera.project(p_cam * rng.uniform(0.01, 100, (len(p_cam), 1))), atol=1e-9)
 
 
 def test_projection_jacobian_agrees_with_differences(camera, rng):
@@ -176,9 +170,7 @@ def test_a_point_without_a_direction_is_nan(camera, p):
 
 @pytest.mark.parametrize("model", ["pinhole", "barrel", "rational"])
 def test_a_point_behind_or_beside_a_perspective_camera_is_nan(model):
-    for value in make(*MODELS[model]).project_with_jacobian(
-        np.array([[0.1, 0.2, -5], [0.3, 0, 0], [1e-10, 0, 0]])
-    ):
+    for value in make(*MODELS[model]).project_with_jacobian(np.array([[0.1, 0.2, -5], [0.3, 0, 0], [1e-10, 0, 0]])):
         assert np.isnan(value).all()
 
 
@@ -239,7 +231,7 @@ REFUSALS = {
     "no coefficients": (["distortion_coefficients"], None, "distortion_coefficients"),
     "three coefficients": (["distortion_coefficients", "data"], [0.1] * 3, "takes 4 or 5 numbers"),
     "nan coefficient": (["distortion_coefficients", "data"], [float("nan")] * 5, "finite"),
-    "huge coefficient": (["distortion_coefficients", "data"], [1e200] * 5, "up to 1e"),
+    "huge coefficient": (["distortion_coefficients", "data"], [1e200] * 5, "no lens bends"),
 }
 
 
@@ -262,6 +254,4 @@ def test_a_bad_camera_file_is_refused(keys, value, match, tmp_path):
 def test_a_vanishing_coefficient_is_none_at_all(tmp_path):
     save_camera(make("plumb_bob", [-0.3, 0, 0, 0, 5e-324]), tmp_path / "camera.yaml")
     edge = ray(np.array([0.5]), np.array([1.0]))
-    assert_array_equal(
-        load_camera(tmp_path / "camera.yaml").project(edge), make(*MODELS["folding"]).project(edge)
-    )
+    assert_array_equal(load_camera(tmp_path / "camera.yaml").project(edge), make(*MODELS["folding"]).project(edge))

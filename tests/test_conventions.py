@@ -27,9 +27,7 @@ def frames(node):
             return (found := frames(value)) and found[::-1]
         case ast.Subscript(value=value, slice=ast.Tuple(elts=indices)):
             found = frames(value)
-            block = all(
-                isinstance(index, ast.Slice) for index in indices[-2:]
-            )  # not the column of a translation
+            block = all(isinstance(index, ast.Slice) for index in indices[-2:])  # not the column of a translation
             return found if block or len(found or ()) == 1 else None
         case ast.Subscript(value=value):
             return frames(value)
@@ -59,9 +57,7 @@ def clashes(left, right):
 
 def misnamed(target, value):
     wanted, found = frames(target), frames(value)
-    renamed = (
-        isinstance(value, ast.Name | ast.Attribute) and len(found or ()) == 1
-    )  # p_ may mean a probability
+    renamed = isinstance(value, ast.Name | ast.Attribute) and len(found or ()) == 1  # p_ may mean a probability
     return bool(wanted and found) and len(wanted) == len(found) and wanted != found and not renamed
 
 
@@ -88,18 +84,14 @@ def frame_offences(tree):
 def public_offences(body, *, methods=False):
     """Line and name of each public function, class or method without docstring or annotation."""
     for node in body:
-        if not isinstance(
-            node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
-        ) or node.name.startswith("_"):
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) or node.name.startswith("_"):
             continue
         if ast.get_docstring(node) is None:
             yield f"line {node.lineno}: {node.name} has no docstring"
         if isinstance(node, ast.ClassDef):
             yield from public_offences(node.body, methods=True)
             continue
-        bound = methods and not any(
-            isinstance(d, ast.Name) and d.id == "staticmethod" for d in node.decorator_list
-        )
+        bound = methods and not any(isinstance(d, ast.Name) and d.id == "staticmethod" for d in node.decorator_list)
         named = [*node.args.posonlyargs, *node.args.args][bound:]
         arguments = [*named, *node.args.kwonlyargs, *filter(None, [node.args.vararg, node.args.kwarg])]
         if node.returns is None or any(argument.annotation is None for argument in arguments):

@@ -82,9 +82,7 @@ def test_se3_adjoint_moves_exp_to_the_left(T, xi):
 
 
 @given(tangents())
-@example(
-    np.array([30, -20, 10, 0.03, -0.02, 0.03])
-)  # just below and just above 0.05 rad, where the series ends
+@example(np.array([30, -20, 10, 0.03, -0.02, 0.03]))  # just below and just above 0.05 rad, where the series ends
 @example(np.array([30, -20, 10, 0.03, -0.03, 0.03]))
 def test_se3_right_jacobian_is_the_integral_of_exp(xi):
     assert_close(g.se3_right_jacobian(xi), left_jacobian(little_adjoint(-xi)), atol=1e-11)
@@ -109,9 +107,7 @@ def test_quaternions_agree_with_scipy_at_any_length(w, length):
     rotation = Rotation.from_rotvec(w)
     quat = g.quat_xyzw_from_rotation(rotation.as_matrix())
     assert quat[3] >= 0
-    assert_close(
-        min(quat, -quat, key=lambda q: np.abs(q - rotation.as_quat()).max()), rotation.as_quat(), atol=1e-14
-    )
+    assert_close(min(quat, -quat, key=lambda q: np.abs(q - rotation.as_quat()).max()), rotation.as_quat(), atol=1e-14)
     assert_close(g.rotation_from_quat_xyzw(-length * quat), rotation.as_matrix(), atol=1e-14)
 
 

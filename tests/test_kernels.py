@@ -69,9 +69,7 @@ def test_registration_cost_agrees_with_complex_numbers(rng):
 
 def fly(seen, rng, *, previous=NEW, theta_previous=np.nan, size=(80, 120, 12)):
     weights, coefficients = np.array([1.0, 0.3, 0.5]), np.array([2.5, 0.5, 1.5, 0.5])
-    return swarm(
-        seen, LIGHTS, previous, theta_previous, LOW, HIGH, weights, 0.7, coefficients, 0.8, size, rng
-    )
+    return swarm(seen, LIGHTS, previous, theta_previous, LOW, HIGH, weights, 0.7, coefficients, 0.8, size, rng)
 
 
 def moved(points, theta, s, tx, ty):
@@ -107,9 +105,7 @@ def test_swarm_finds_a_known_transform(n, rng):
 
 def test_swarm_is_decided_by_its_seed(rng):
     seen, seed = rng.normal(size=(5, 2)), rng.integers(2**32)
-    one, again, other = (
-        fly(seen, np.random.default_rng(s), size=(20, 10, 3))[0] for s in (seed, seed, seed + 1)
-    )
+    one, again, other = (fly(seen, np.random.default_rng(s), size=(20, 10, 3))[0] for s in (seed, seed, seed + 1))
     assert_array_equal(one, again)
     assert (one != other).any()
 

@@ -44,9 +44,7 @@ def test_lights_project_as_in_opencv(camera, T_dock_cam):
 
 def test_pose_jacobian_agrees_with_differences(camera, T_dock_cam):
     uv, J_uv_pose = project_lights_with_jacobian(camera, T_dock_cam, DEEP)
-    expected = numeric_jacobian(
-        lambda xi: project_lights(camera, T_dock_cam @ se3_exp(xi), DEEP), np.zeros(6)
-    )
+    expected = numeric_jacobian(lambda xi: project_lights(camera, T_dock_cam @ se3_exp(xi), DEEP), np.zeros(6))
     assert_close(uv, project_lights(camera, T_dock_cam, DEEP))
     assert_close(J_uv_pose, expected, atol=1e-4)
 
@@ -56,9 +54,7 @@ def test_no_lights_give_no_rows(camera):
     assert (uv.shape, J_uv_pose.shape) == ((0, 2), (0, 2, 6))
 
 
-@pytest.mark.parametrize(
-    "p_dock", [PLANE, PLANE[:4], DEEP, np.repeat(DEEP, 2, axis=0)[::2]], ids=lambda p: p.shape[0]
-)
+@pytest.mark.parametrize("p_dock", [PLANE, PLANE[:4], DEEP, np.repeat(DEEP, 2, axis=0)[::2]], ids=lambda p: p.shape[0])
 def test_sqpnp_recovers_the_pose(p_dock, camera, T_dock_cam):
     assert_close(sqpnp(camera, p_dock, project_lights(camera, T_dock_cam, p_dock)), T_dock_cam, atol=1e-5)
 

@@ -90,7 +90,14 @@ def registration_cost(x: Array, seen: Array, lights: Array, previous: Array, w1:
 
 @njit(cache=True)
 def _fitness(
-    x: Array, seen: Array, lights: Array, previous: Array, theta_previous: float, w1: float, w2: float, penalty: float
+    x: Array,
+    seen: Array,
+    lights: Array,
+    previous: Array,
+    theta_previous: float,
+    w1: float,
+    w2: float,
+    penalty: float,
 ) -> float:
     cost = registration_cost(x, seen, lights, previous, w1, w2)
     column = assign(cost)

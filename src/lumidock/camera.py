@@ -25,10 +25,9 @@ _COEFFICIENTS: dict[str, tuple[int, ...]] = {
     "rational_polynomial": (8,),
     "equidistant": (4,),
 }
-_MAX_COEFFICIENT = 1e6  # beyond any lens, and far from what overflows
-_FOLD_MARGIN = 0.999
+_FOLD_MARGIN, _FOLD_STEPS = 0.999, 10_000
 _NEWTON_STEPS = 40
-_NEWTON_TOLERANCE = 1e-10  # in normalised image units: 2e-7 px at f = 2000 px
+_NEWTON_TOLERANCE, _NEWTON_ACCEPTED = 1e-10, 1e-9  # in normalised image units: 2e-7, 2e-6 px at f = 2000 px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +39,7 @@ class Camera:
     K: Array
     model: DistortionModel = "plumb_bob"
     distortion: Array = field(default_factory=lambda: np.zeros(5))
-    _fold: float = field(init=False)  # where the radial model ends: normalised radius, or angle in rad
+    _fold: float = field(init=False)  # where the lens model ends: normalised radius, or angle in rad
 
     def __post_init__(self) -> None:
         require_shape("K", self.K, 3, 3)
@@ -61,8 +60,8 @@ class Camera:
     def contains(self, uv: Array, *, margin_px: float = 0.0) -> np.ndarray:
         """Whether pixels `uv` (N, 2) lie inside the image by at least `margin_px`; NaN is outside. Returns (N,)."""
         limit = np.array([self.width, self.height]) - 0.5 - margin_px
-        inside: np.ndarray = ((uv > margin_px - 0.5) & (uv < limit)).all(axis=-1)
-        return inside
+        inside = ((uv > margin_px - 0.5) & (uv < limit)).all(axis=-1)
+        return np.asarray(inside)
 
     def project(self, p_cam: Array) -> Array:
         """Pixels `uv` (N, 2) of points `p_cam` (N, 3) m; NaN where the lens does not see the point."""
@@ -108,35 +107,41 @@ def _rational_terms(distortion: Array) -> tuple[Array, Array, float, float]:
 
 
 def _fold_of(model: str, distortion: Array) -> float:
-    """Radius (angle for equidistant) up to which the distorted radius grows; infinite if it always does.
+    """Radius (angle for equidistant) within which the lens map is one to one; infinite if it always is.
+
+    A perspective lens map is a gradient, so it is one to one on a disk where its Hessian is positive definite: where
+    the radial slope and the magnification both exceed 6 |p| r, the most that the tangential terms take away.
+    """
+    if model == "equidistant":
+        theta = np.linspace(0.0, np.pi, _FOLD_STEPS)
+        return min(_last_before(_theta_distorted(theta, distortion)[1] <= 0.0, theta), np.pi)
+    num, den, p1, p2 = _rational_terms(distortion)
+    r = np.tan(np.linspace(0.0, np.pi / 2, _FOLD_STEPS, endpoint=False))
+    with np.errstate(all="ignore"):  # absurd coefficients overflow, and fail the comparison
+        D = _horner(den, r * r)
+        g, dg = _radial(num, den, r * r)
+        sound = (D > 0.0) & (np.minimum(g, g + 2.0 * r * r * dg) > 6.0 * np.hypot(p1, p2) * r)
+    return _last_before(~sound, r)
+
+
+def _last_before(ended: NDArray[np.bool_], r: Array) -> float:
+    """The last `r` (N,) before the first that has `ended` (N,), infinite if none has.
 
     A hair less than that, where Newton's method still converges.
     """
-    poly = np.polynomial.polynomial
-    if model == "equidistant":
-        derivative = np.array([1.0, 3.0, 5.0, 7.0, 9.0]) * np.concatenate([[1.0], distortion])
-        return min(_FOLD_MARGIN * _first_root(derivative), np.pi)
-    num, den, _, _ = _rational_terms(distortion)
-    # d(r N/D)/dr = 0  <=>  (N + 2 u N') D - 2 u N D' = 0 with u = r^2; a pole D = 0 ends the model as well
-    twice_u = np.array([0.0, 2.0])
-    slope = poly.polysub(
-        poly.polymul(poly.polyadd(num, poly.polymul(twice_u, poly.polyder(num))), den),
-        poly.polymul(poly.polymul(twice_u, num), poly.polyder(den)),
-    )
-    return _FOLD_MARGIN * min(_first_root(slope), _first_root(den))
-
-
-def _first_root(coefficients: Array) -> float:
-    """Square root of the smallest positive real root of a polynomial in r^2, or infinity."""
-    told = np.where(np.abs(coefficients) < 1e-30, 0.0, coefficients)  # smaller ones overflow when divided by
-    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(told, "b"))
-    real = roots[np.abs(roots.imag) < 1e-9].real
-    positive = real[real > 1e-12]
-    return float(np.sqrt(positive.min())) if positive.size else np.inf
+    return _FOLD_MARGIN * float(r[max(int(ended.argmax()) - 1, 0)]) if ended.any() else np.inf
 
 
 def _horner(coefficients: Array, u: Array) -> Array:
     return np.polynomial.polynomial.polyval(u, coefficients)
+
+
+def _radial(num: Array, den: Array, u: Array) -> tuple[Array, Array]:
+    """Magnification N/D at the squared radius `u` (N,) and its derivative."""
+    poly = np.polynomial.polynomial
+    D = _horner(den, u)
+    g = _horner(num, u) / D
+    return g, (_horner(poly.polyder(num), u) - g * _horner(poly.polyder(den), u)) / D
 
 
 def _distort_xy(xy: Array, distortion: Array) -> tuple[Array, Array]:
@@ -144,9 +149,7 @@ def _distort_xy(xy: Array, distortion: Array) -> tuple[Array, Array]:
     num, den, p1, p2 = _rational_terms(distortion)
     x, y = xy[:, 0], xy[:, 1]
     u = x * x + y * y
-    N, D = _horner(num, u), _horner(den, u)
-    g = N / D
-    dg = (_horner(np.polynomial.polynomial.polyder(num), u) - g * _horner(np.polynomial.polynomial.polyder(den), u)) / D
+    g, dg = _radial(num, den, u)
     out = np.stack([x * g + 2 * p1 * x * y + p2 * (u + 2 * x * x), y * g + p1 * (u + 2 * y * y) + 2 * p2 * x * y], 1)
     cross = 2 * x * y * dg + 2 * p1 * x + 2 * p2 * y
     J = np.empty((len(xy), 2, 2))
@@ -156,22 +159,11 @@ def _distort_xy(xy: Array, distortion: Array) -> tuple[Array, Array]:
     return out, J
 
 
-def _one_to_one(J: Array) -> NDArray[np.bool_]:
-    """Where the lens map is one to one (N,): it is a gradient, and `J` (N, 2, 2) its positive definite Hessian.
-
-    The radial fold alone does not tell: the tangential terms fold the map as well.
-    """
-    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-    return np.asarray((J[:, 0, 0] > 0.0) & (det > 0.0))
-
-
 def _distort_rational(p_cam: Array, distortion: Array, fold: float) -> tuple[Array, Array]:
     z = np.where(p_cam[:, 2] > 0.0, p_cam[:, 2], np.nan)
     xy = p_cam[:, :2] / z[:, None]
     xy[np.hypot(xy[:, 0], xy[:, 1]) >= fold] = np.nan
     out, J_xy = _distort_xy(xy, distortion)
-    out[~_one_to_one(J_xy)] = np.nan
-    J_xy[~_one_to_one(J_xy)] = np.nan
     J_p = np.zeros((len(p_cam), 2, 3))
     J_p[:, 0, 0] = J_p[:, 1, 1] = 1.0 / z
     J_p[:, :, 2] = -xy / z[:, None]
@@ -191,9 +183,8 @@ def _undistort_rational(xy_distorted: Array, distortion: Array, fold: float) -> 
             step_x = (J[:, 1, 1] * error[:, 0] - J[:, 0, 1] * error[:, 1]) / det
             step_y = (J[:, 0, 0] * error[:, 1] - J[:, 1, 0] * error[:, 0]) / det
             xy = _shorten(xy - np.stack([step_x, step_y], 1), fold)
-        out, J = _distort_xy(xy, distortion)
-        residual = np.abs(out - xy_distorted).max(axis=1)
-        xy[~((residual < 1e-7) & _one_to_one(J))] = np.nan
+        residual = np.abs(_distort_xy(xy, distortion)[0] - xy_distorted).max(axis=1)
+    xy[~(residual < _NEWTON_ACCEPTED)] = np.nan
     ray = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
     return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
 
@@ -245,7 +236,7 @@ def _undistort_equidistant(xy_distorted: Array, distortion: Array, fold: float) 
         if np.all(np.abs(error) < _NEWTON_TOLERANCE):
             break
         theta = np.clip(theta - error / slope, 0.0, fold)
-    theta = np.where(np.abs(_theta_distorted(theta, distortion)[0] - bent) < 1e-7, theta, np.nan)
+    theta = np.where(np.abs(_theta_distorted(theta, distortion)[0] - bent) < _NEWTON_ACCEPTED, theta, np.nan)
     direction = xy_distorted / np.maximum(bent, 1e-300)[:, None]
     return np.concatenate([np.sin(theta)[:, None] * direction, np.cos(theta)[:, None]], axis=1)
 
@@ -283,9 +274,10 @@ def load_camera(path: Path) -> Camera:
     if len(distortion) not in _COEFFICIENTS[info.distortion_model]:
         wanted = " or ".join(map(str, _COEFFICIENTS[info.distortion_model]))
         raise InputError(f"{path}: distortion_coefficients: {info.distortion_model} takes {wanted} numbers")
-    if (np.abs(distortion) > _MAX_COEFFICIENT).any():
-        raise InputError(f"{path}: distortion_coefficients: wanted numbers up to {_MAX_COEFFICIENT:.0e}")
-    return Camera(info.image_width, info.image_height, K, info.distortion_model, distortion)
+    camera = Camera(info.image_width, info.image_height, K, info.distortion_model, distortion)
+    if camera._fold == 0.0:
+        raise InputError(f"{path}: distortion_coefficients: no lens bends light like this")
+    return camera
 
 
 def save_camera(camera: Camera, path: Path, *, name: str = "camera") -> None:

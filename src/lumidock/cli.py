@@ -16,7 +16,14 @@ from typing import Annotated, Any
 import click
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from lumidock.camera import load_camera
 from lumidock.config import Config, load_config
@@ -102,7 +109,9 @@ def _run(
         _copy(station_file, out / "station.yaml")
         _copy(camera_file, out / "camera.yaml")
         done = count(1)
-        summary = run_source(opened, localizer, folder, setup, on_fix=lambda _item, _fix: progress(next(done), opened.count))
+        summary = run_source(
+            opened, localizer, folder, setup, on_fix=lambda _item, _fix: progress(next(done), opened.count)
+        )
     counts = summary.as_dict()
     if as_json:
         print(json.dumps(counts, indent=2))
@@ -178,7 +187,10 @@ def _demo(
     sequence, run_folder = out / "sequence", out / "run"
     _prepare(sequence, True, remove=("frames",))
     scenario = load_scenario("approach")
-    station_file, camera_file = _shipped_or_path("station", _DEFAULT_STATION), _shipped_or_path("camera", _DEFAULT_CAMERA)
+    station_file, camera_file = (
+        _shipped_or_path("station", _DEFAULT_STATION),
+        _shipped_or_path("camera", _DEFAULT_CAMERA),
+    )
     dock, lens = load_station(station_file), load_camera(camera_file)
     _copy(station_file, sequence / "station.yaml")
     with _progress("simulating") as progress:
@@ -244,7 +256,13 @@ def _prepare(folder: Path, force: bool, *, remove: tuple[str, ...] = ()) -> None
 @contextmanager
 def _progress(title: str) -> Iterator[Callable[[int, int | None], None]]:
     """A bar with ETA on standard error, for a person only; yields a callback (done, total)."""
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
     console = Console(stderr=True)
     with Progress(TextColumn("{task.description}"), *columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=None)

@@ -33,7 +33,9 @@ class ExtractConfig(Section):
     min_roundness: Fraction = 0.60  # 4 pi area / perimeter^2
     min_compactness: Fraction = 0.55  # area / area of the fitted circle, or its inverse
     max_arc_error: Fraction = 0.06  # rms distance from the circle, of its radius, where the picture's edge cuts a light
-    max_regions: PositiveInt = 80  # more mean that the threshold is still inside the noise; at last the largest are kept
+    max_regions: PositiveInt = (
+        80  # more mean that the threshold is still inside the noise; at last the largest are kept
+    )
 
 
 class LayersConfig(Section):
@@ -59,7 +61,10 @@ class PsoConfig(Section):
     c2: tuple[float, float] = (1.5, 0.5)  # base and final, eq. (6)
     k: PositiveFloat = 0.8  # eq. (4)
     theta_deg: tuple[float, float] = (-10.0, 10.0)
-    scale: tuple[float, float] = (0.5, 12.0)  # the paper's (0.5, 8) and (-1, 1) bear a stray light at the picture's edge
+    scale: tuple[float, float] = (
+        0.5,
+        12.0,
+    )  # the paper's (0.5, 8) and (-1, 1) bear a stray light at the picture's edge
     shift: tuple[float, float] = (-2.0, 2.0)  # from 18.64 m on; from 30 m it takes more
     w1: PositiveFloat = 1.0  # eq. (8), this frame's residual
     w2: Annotated[float, Field(ge=0.0)] = 0.3  # eq. (8), distance from the previous frame

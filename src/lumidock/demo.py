@@ -72,7 +72,9 @@ def summary_lines(result: dict[str, Any], counts: dict[str, Any]) -> list[str]:
     gap = result["longest_gap_s"]
     latency = counts["latency_us"].get("p50", np.nan) / 1000.0
     return [
-        f"fixes       {result['valid']} of {result['frames']} frames, longest gap {gap:.2f} s" if gap else "fixes       none",
+        f"fixes       {result['valid']} of {result['frames']} frames, longest gap {gap:.2f} s"
+        if gap
+        else "fixes       none",
         f"front layer {reach(front)}",
         f"rear layer  {reach(rear)}",
         f"error       median {error['lateral_m']['median']:.3f} m lateral, {error['axial_m']['median']:.3f} m axial, "

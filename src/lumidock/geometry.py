@@ -1,6 +1,6 @@
 """SE(3): exponential, logarithm, inverse, adjoint, Jacobians and the transport of covariances.
 
-A tangent vector is xi = [translation m, rotation rad]; perturbations stand on the right: `T_dock_cam @ se3_exp(xi)`.
+A tangent vector is xi = [translation m, rotation rad]; perturbations stand on the right, T_dock_cam @ se3_exp(xi).
 Source: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics", 2018 (eq. numbers below).
 """
 
@@ -16,7 +16,7 @@ _SMALL_ANGLE = 1e-4  # rad; below it the Taylor series is exact to double precis
 
 
 def skew(v: Array) -> Array:
-    """Cross-product matrix (3, 3) of `v` (3,): skew(v) @ w = v x w."""
+    """Cross-product matrix (3, 3): `skew(v) @ w` is v x w."""
     x, y, z = v
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
@@ -116,12 +116,7 @@ def _left_jacobian_q(rho: Array, w: Array) -> Array:
         b = (angle - s) / angle**3
         c = (angle**2 + 2.0 * k - 2.0) / (2.0 * angle**4)
         d = (2.0 * angle - 3.0 * s + angle * k) / (2.0 * angle**5)
-    Q: Array = (
-        0.5 * P
-        + b * (WP + PW + WPW)
-        + c * (W @ WP + PW @ W - 3.0 * WPW)
-        + d * (WPW @ W + W @ WPW)
-    )
+    Q: Array = 0.5 * P + b * (WP + PW + WPW) + c * (W @ WP + PW @ W - 3.0 * WPW) + d * (WPW @ W + W @ WPW)
     return Q
 
 

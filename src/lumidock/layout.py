@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 from lumidock.datatypes import Array
 
 _Complex = NDArray[np.complex128]
-_SCALE = (0.5, 2.0)  # a layer seen at half or double its true size is a wrong range that the approach excludes
+_SCALE = (
+    0.5,
+    2.0,
+)  # a layer seen at half or double its true size is a wrong range that the approach excludes
 
 
 def worst_confusion(

@@ -107,7 +107,9 @@ def _by_range(true: dict[str, Array], common: list[str], errors: Array) -> list[
         frames = int(((z_all >= low) & (z_all < high)).sum())
         inside = (z_found >= low) & (z_found < high)
         if frames:
-            table.append({"z_m": [low, high], "frames": frames, "valid": int(inside.sum())} | _error_summary(errors[inside]))
+            table.append(
+                {"z_m": [low, high], "frames": frames, "valid": int(inside.sum())} | _error_summary(errors[inside])
+            )
     return table
 
 

@@ -59,7 +59,13 @@ def _draw_detections(canvas: np.ndarray, fix: Fix, station: Station, scale: floa
 
 def _draw_caption(canvas: np.ndarray, fix: Fix) -> None:
     seconds = fix.t_ns * 1e-9
-    _put(canvas, f"{seconds:7.2f} s   {fix.stage}   {fix.status}   {fix.n_used} of {fix.n_seen} lights", (14, 28), _TEXT, 0.62)
+    _put(
+        canvas,
+        f"{seconds:7.2f} s   {fix.stage}   {fix.status}   {fix.n_used} of {fix.n_seen} lights",
+        (14, 28),
+        _TEXT,
+        0.62,
+    )
     if fix.T_dock_cam is None:
         _put(canvas, f"no fix: {fix.reason}", (14, 56), _SPURIOUS, 0.62)
     else:

@@ -122,7 +122,9 @@ def _process(localizer: TwoDoors, item: Item) -> tuple[Fix, int | None, str]:
     except FrameError as error:
         name = item.name if isinstance(item, Frame) else item.frame
         return _unusable(name, item.t_ns, error.reason), None, str(error)
-    error_text = f"frame {fix.frame}: stamp {fix.t_ns} does not follow the one before" if fix.reason == "bad_stamp" else ""
+    error_text = (
+        f"frame {fix.frame}: stamp {fix.t_ns} does not follow the one before" if fix.reason == "bad_stamp" else ""
+    )
     return fix, (time.perf_counter_ns() - start) // 1000, error_text
 
 

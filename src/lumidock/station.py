@@ -48,7 +48,13 @@ class Station:
 
     def __post_init__(self) -> None:
         n = len(self.ids)
-        for name, shape in {"p_dock": (n, 3), "axis": (n, 3), "layer": (n,), "beam_deg": (n,), "power_w": (n,)}.items():
+        for name, shape in {
+            "p_dock": (n, 3),
+            "axis": (n, 3),
+            "layer": (n,),
+            "beam_deg": (n,),
+            "power_w": (n,),
+        }.items():
             require_shape(name, getattr(self, name), *shape)
 
     def __len__(self) -> int:

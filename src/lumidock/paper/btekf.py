@@ -1,8 +1,8 @@
 """The backtracking extended Kalman filter that names lights from history, paper section 3.2.3.
 
 The state is the pose (right perturbation of T_dock_cam) and the twist in `cam`: the paper's "Gaussian motion model
-constructed from previous pose estimates". The gate of eq. (12) as printed has no measurement noise; here it has, and the
-search has a branch for a light that is missing, without which one missing light would void every frame.
+constructed from previous pose estimates". The gate of eq. (12) as printed has no measurement noise; here it has, and
+the search has a branch for a light that is missing, without which one missing light would void every frame.
 """
 
 from __future__ import annotations

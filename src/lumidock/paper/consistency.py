@@ -11,8 +11,8 @@ from lumidock.datatypes import Array
 def consistent(lights_xy: Array, xy: Array, config: ConsistencyConfig) -> bool:
     """Whether the matched spots `xy` (N, 2) look like their lights `lights_xy` (N, 2) in every triple; N >= 3.
 
-    The angle is taken between P_i P_j and P_j P_k as the vectors of eq. (10) have it; with both point sets treated alike
-    it does not matter that the text calls it the angle at P_i.
+    The angle is taken between P_i P_j and P_j P_k as the vectors of eq. (10) have it; with both point sets treated
+    alike it does not matter that the text calls it the angle at P_i.
     """
     ratio, angle = _triples(lights_xy)
     seen_ratio, seen_angle = _triples(xy)

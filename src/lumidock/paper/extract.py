@@ -1,8 +1,8 @@
 """Light extraction from a frame, paper section 3.1.1.
 
-The interval-adaptive Otsu threshold (the paper's [22]) is not specified there. Read here as: Otsu on the grey levels above
-the background's mode, repeated on the levels above each result until the classes separate; first for the whole frame, then
-within every region until its own light stands at half height.
+The interval-adaptive Otsu threshold (the paper's [22]) is not specified there. Read here as: Otsu on the grey levels
+above the background's mode, repeated on the levels above each result until the classes separate; first for the whole
+frame, then within every region until its own light stands at half height.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from lumidock.config import ExtractConfig
-from lumidock.datatypes import Array, Detections, Frame, Image
+from lumidock.datatypes import Array, Detections, Frame, Image, Indices
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +29,10 @@ class _Spot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Region:
-    """A connected region: the window of the gray image it lies in, the region's mask, the window's offset (u, v) and the
-    size (width, height) of the whole image."""
+    """A connected region: its window of the gray image and its mask there.
+
+    `offset` (u, v) of the window in the whole image, whose `size` is (width, height).
+    """
 
     gray: Image
     mask: Image
@@ -47,17 +49,23 @@ class _Region:
 def lights(frame: Frame, config: ExtractConfig) -> Detections:
     """Find the lights of a frame: centres, radii and fluxes; the layer is not known yet."""
     gray = to_gray(frame.image, config.gray)
-    for background, threshold in separating_thresholds(gray, config):
-        binary, outlines = _outlines(gray, threshold)
-        if len(outlines) <= config.max_regions:
-            break
-    regions = _connected_regions(gray, binary, sorted(outlines, key=len)[-config.max_regions :])
+    background, threshold, binary, outlines = _separated(gray, config)
+    regions = _connected_regions(gray, binary, outlines)
     spots = [spot for region in regions for spot in _spots(region, threshold, background, config)]
     spots = [spot for spot in spots if _stands_out(spot, gray, config)]
     columns = np.array([[s.u, s.v, s.radius, s.flux] for s in spots]).reshape(-1, 4)
     unknown = np.full(len(spots), np.nan)
     uv, radius_px, flux = columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy()
     return Detections(frame.name, frame.t_ns, uv, radius_px, flux, np.ones(len(spots)), unknown)
+
+
+def _separated(gray: Image, config: ExtractConfig) -> tuple[int, int, Image, list[Array]]:
+    """Background, threshold, binarised frame and outlines at the lowest threshold that leaves few enough regions."""
+    for background, threshold in separating_thresholds(gray, config):  # noqa: B007
+        binary, outlines = _outlines(gray, threshold)
+        if len(outlines) <= config.max_regions:
+            break
+    return background, threshold, binary, sorted(outlines, key=len)[-config.max_regions :]
 
 
 def to_gray(image: Image, kind: str) -> Image:
@@ -75,7 +83,7 @@ def separating_thresholds(gray: Image, config: ExtractConfig) -> Iterator[tuple[
 
     The next one is wanted when a threshold leaves more regions than there can be lights.
     """
-    histogram = cv2.calcHist([gray], [0], None, [256], [0, 256]).ravel()
+    histogram = np.asarray(cv2.calcHist([gray], [0], None, [256], [0, 256]), float).ravel()
     background = int(np.argmax(histogram[:255]))
     floor = background + max(config.min_step, config.contrast * _spread_below(histogram, background))
     threshold = int(np.ceil(floor))
@@ -94,7 +102,7 @@ def _spread_below(histogram: Array, mode: int) -> float:
     return float(np.sqrt((below * steps**2).sum() / below.sum()))
 
 
-def otsu(histogram: Array, low: int) -> int:
+def otsu(histogram: Array | Indices, low: int) -> int:
     """Otsu's threshold over the grey levels from `low` up; `low` itself when only one level is left.
 
     Source: N. Otsu, 1979: the cut that maximises the between-class variance.
@@ -116,7 +124,7 @@ def _outlines(gray: Image, threshold: int) -> tuple[Image, list[Array]]:
     _, binary = cv2.threshold(gray, threshold, 255, cv2.THRESH_BINARY)
     edges = cv2.dilate(cv2.Canny(binary, 100, 200), np.ones((3, 3), np.uint8))  # closes the gaps Canny leaves
     contours, _ = cv2.findContours(edges, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    return np.asarray(binary, np.uint8), list(contours)
+    return np.asarray(binary, np.uint8), [np.asarray(contour) for contour in contours]
 
 
 def _connected_regions(gray: Image, binary: Image, outlines: list[Array]) -> Iterator[_Region]:
@@ -129,9 +137,7 @@ def _connected_regions(gray: Image, binary: Image, outlines: list[Array]) -> Ite
         yield from _components(gray[window], lit, (u, v), (gray.shape[1], gray.shape[0]))
 
 
-def _components(
-    gray: Image, binary: Image, offset: tuple[int, int], size: tuple[int, int]
-) -> Iterator[_Region]:
+def _components(gray: Image, binary: Image, offset: tuple[int, int], size: tuple[int, int]) -> Iterator[_Region]:
     """Connected components of a binary window, each in a window of its own."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(binary, connectivity=8)
     for label in range(1, count):
@@ -156,7 +162,7 @@ def _spots(region: _Region, threshold: int, background: int, config: ExtractConf
 
 
 def _next_level(inside: Image, threshold: int, half: int, config: ExtractConfig) -> int:
-    """The region's own Otsu level while it lies under half height or parts two clear classes; else the same threshold."""
+    """The region's own Otsu level while under half height, or where it parts two clear classes; else the threshold."""
     higher = otsu(np.bincount(inside, minlength=256), threshold + 1)
     core = inside > higher
     if np.count_nonzero(core) < config.min_area_px:
@@ -205,15 +211,18 @@ def _measure(piece: _Region, background: int, config: ExtractConfig) -> _Spot | 
 
 
 def _fit_arc(outline: Array, size: tuple[int, int], config: ExtractConfig) -> tuple[Array, float, bool]:
-    """Circle through the part of an outline (N, 2) inside the picture, and whether that is an arc around a visible
-    centre."""
+    """Circle through an outline's points (N, 2) inside the picture; whether they are an arc around a visible centre."""
     last = np.array(size) - 1.0
     arc = outline[((outline > 0) & (outline < last)).all(axis=1)]
     if len(arc) < 8:
         return np.zeros(2), 0.0, False
     center, radius = fit_circle(arc)
     off = np.hypot(*(arc - center).T) - radius
-    return center, radius, bool((center > 0).all() and (center < last).all() and off.std() < config.max_arc_error * radius)
+    return (
+        center,
+        radius,
+        bool((center > 0).all() and (center < last).all() and off.std() < config.max_arc_error * radius),
+    )
 
 
 def _stands_out(spot: _Spot, gray: Image, config: ExtractConfig) -> bool:
@@ -241,7 +250,7 @@ def fit_circle(points: Array) -> tuple[Array, float]:
     x, y = (points - mean).T
     A = np.stack([2.0 * x, 2.0 * y, np.ones(len(x))], axis=1)
     (a, b, c), *_ = np.linalg.lstsq(A, x * x + y * y, rcond=None)
-    return mean + [a, b], float(np.sqrt(max(c + a * a + b * b, 0.0)))
+    return mean + np.array([a, b]), float(np.sqrt(max(c + a * a + b * b, 0.0)))
 
 
 def _is_round(outline: Array, area: float, radius: float, config: ExtractConfig) -> bool:

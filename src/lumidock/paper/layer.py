@@ -1,4 +1,4 @@
-"""One layer through matching, filter, correction and pose: paper sections 3.2 and 3.3, independent of the other layer."""
+"""One layer on its own through matching, filter, correction and pose, paper sections 3.2 and 3.3."""
 
 from __future__ import annotations
 

@@ -70,8 +70,8 @@ class LayerDiscriminator:
 def smaller_cluster(radius_px: Array) -> np.ndarray:
     """Members (N,) of the smaller-radius cluster of the split in two with the least variance: eq. (1), solved exactly.
 
-    In one dimension the best clusters are contiguous, so every cut of the sorted radii is tried. NaN radii and fewer than
-    two spots give no members.
+    In one dimension the best clusters are contiguous, so every cut of the sorted radii is tried. NaN radii and fewer
+    than two spots give no members.
     """
     members = np.zeros(len(radius_px), bool)
     if len(radius_px) < 2 or not np.isfinite(radius_px).all():

@@ -6,7 +6,7 @@ import numpy as np
 
 from lumidock.camera import Camera
 from lumidock.config import PaperConfig
-from lumidock.datatypes import Detections, Fix, Frame, LayerPose, Match
+from lumidock.datatypes import Detections, Fix, Frame, Match
 from lumidock.errors import FrameError, InputError
 from lumidock.paper import extract
 from lumidock.paper.guidance import Guidance
@@ -31,8 +31,7 @@ class PaperLocalizer:
     def forget(self) -> None:
         """Drop all history, as before the first frame."""
         self._layers = [
-            LayerLocalizer(self.station, name, self.camera, self.config)
-            for name in self.station.layers_front_to_rear()
+            LayerLocalizer(self.station, name, self.camera, self.config) for name in self.station.layers_front_to_rear()
         ]
         self._discriminator = LayerDiscriminator(self.config.layers)
         self._guidance = Guidance([(layer.layer, len(layer.lights)) for layer in self._layers])

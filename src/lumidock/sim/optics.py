@@ -1,4 +1,4 @@
-"""The light of the dock's lamps that reaches the sensor: electrons per pixel in three bands, for a lamp and for a frame.
+"""The light of the dock's lamps that reaches the sensor: electrons per pixel in three bands.
 
 Bands are 455, 530 and 610 nm, in the order B, G, R throughout.
 """
@@ -39,8 +39,11 @@ _MAX_REACH_PX = 420
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lamps:
-    """The lamps in one frame: pixels `uv` (M, 2), direct and halo electrons in B, G, R (M, 3), window and halo radius in
-    px (M,), and whether each is lit and in the picture (M,)."""
+    """The M lamps in one frame.
+
+    Pixels `uv` (M, 2), direct and halo electrons in B, G, R (M, 3), radius of the window and of the halo in px (M,),
+    and whether each is `lit` and in the picture (M,).
+    """
 
     uv: Array
     direct_e: Array
@@ -90,8 +93,7 @@ def expose(scenario: Scenario, seen: Lamps, camera: Camera) -> Array:
 
 
 def with_strays(seen: Lamps, strays: Array) -> Lamps:
-    """The lamps with others at pixels `strays` (S, 2) added, as bright as the station's brightest, which need not be in
-    view."""
+    """The lamps with others added at pixels `strays` (S, 2), each as bright as the station's brightest."""
     if not len(strays):
         return seen
     like = int(np.argmax(seen.direct_e.sum(axis=1)))
@@ -145,7 +147,7 @@ def _add_patch(
 
 
 def core_profile(du: Array, dv: Array, window_px: float, blur_px: float) -> Array:
-    """Share (V, U) of a lamp's direct light on each pixel: a uniform disc, blurred by a Gaussian, integrated over pixels.
+    """Share (V, U) of a lamp's direct light on each pixel: a uniform disc, blurred by a Gaussian, summed over pixels.
 
     The disc is a sum of Gaussians on a sunflower of points, so that the centre is exact at any radius.
     """

@@ -147,7 +147,10 @@ def trajectory(scenario: Scenario, rng: np.random.Generator) -> tuple[np.ndarray
 
 def _approach(path: Path3D) -> Array:
     count = round(abs(path.start_z_m - path.end_z_m) / (path.speed_m_s * path.frame_interval_s)) + 1
-    z = path.start_z_m + np.arange(count) * np.sign(path.end_z_m - path.start_z_m) * path.speed_m_s * path.frame_interval_s
+    z = (
+        path.start_z_m
+        + np.arange(count) * np.sign(path.end_z_m - path.start_z_m) * path.speed_m_s * path.frame_interval_s
+    )
     return np.stack([np.zeros(count), np.zeros(count), z], axis=1)
 
 

@@ -22,7 +22,7 @@ def picture(electrons: Array, sensor: Sensor, rng: np.random.Generator) -> Image
     noise *= np.float32(_LEVELS / sensor.full_well_e)
     raw = np.clip(noise, 0, _LEVELS).astype(np.uint16)
     bgr = cv2.demosaicing(raw, cv2.COLOR_BayerRGGB2BGR)
-    return _gamma_table(sensor.gamma)[bgr]
+    return np.asarray(_gamma_table(sensor.gamma)[bgr])
 
 
 def _gamma_table(gamma: float) -> Image:

@@ -53,7 +53,7 @@ def write_rendered(
     out: Path,
     *,
     workers: int | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = lambda _done, _total: None,
 ) -> int:
     """Render a scenario into the sequence folder `out`; the same bytes whatever `workers`. Returns the frame count."""
     t_ns, poses = trajectory(scenario, np.random.default_rng([seed, 0]))
@@ -67,7 +67,7 @@ def write_rendered(
     names = [f"{number:06d}" for number in range(len(t_ns))]
     _write_common(out, camera, names, [f"{name}.jpg" for name in names], t_ns, poses)
     lights_truth, spurious = zip(*rows, strict=True)
-    _write_lights_truth(out, station, names, lights_truth)
+    _write_lights_truth(out, names, lights_truth)
     _write_spurious(out, names, spurious)
     return len(t_ns)
 
@@ -103,7 +103,7 @@ def write_detections(scenario: Scenario, station: Station, camera: Camera, seed:
     poses = np.array([frame.T_dock_cam for frame in frames])
     _write_common(out, camera, names, [""] * len(names), t_ns, poses)
     _write_csv(out / "detections.csv", DETECTION_COLUMNS, _detection_rows(frames))
-    _write_lights_truth(out, station, names, [_spot_truth(frame, station) for frame in frames])
+    _write_lights_truth(out, names, [_spot_truth(frame, station) for frame in frames])
     _write_spurious(out, names, [frame.detections.uv[frame.light < 0] for frame in frames])
     return len(frames)
 
@@ -141,10 +141,12 @@ def _write_common(
     _write_csv(out / "truth.csv", columns, rows)
 
 
-def _write_lights_truth(out: Path, station: Station, names: list[str], rows: Iterable[list[list[object]]]) -> None:
+def _write_lights_truth(out: Path, names: list[str], rows: Iterable[list[list[object]]]) -> None:
     columns = ("frame", "light", "u_px", "v_px", "visible", "snr")
     _write_csv(
-        out / "lights_truth.csv", columns, ([name, *row] for name, group in zip(names, rows, strict=True) for row in group)
+        out / "lights_truth.csv",
+        columns,
+        ([name, *row] for name, group in zip(names, rows, strict=True) for row in group),
     )
 
 

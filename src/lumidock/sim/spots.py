@@ -17,8 +17,11 @@ from lumidock.station import Station
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpotFrame:
-    """One frame's detections and truth: pose `T_dock_cam` (4, 4), the light behind each detection `light` (N,), -1 for a
-    spurious one, the true pixels `uv` (M, 2) of all lights, and which of them are `in_view` (M,) before any go dark."""
+    """One frame's detections and their truth.
+
+    Pose `T_dock_cam` (4, 4); the `light` (N,) behind each detection, -1 for a spurious one; the true pixels `uv` (M, 2)
+    of all lights, and which of them are `in_view` (M,) before any go dark.
+    """
 
     detections: Detections
     T_dock_cam: Array

@@ -60,7 +60,8 @@ class RunFolder:
         self._write("fixes.csv", [_fix_row(fix, latency_us, t_ns)])
         self._write("lights.csv", self._light_rows(fix))
         self._write(
-            "layers.csv", ([fix.frame, p.layer, p.n_used, p.source, *_pose_fields(p.T_dock_cam)] for p in fix.by_layer)
+            "layers.csv",
+            ([fix.frame, p.layer, p.n_used, p.source, *_pose_fields(p.T_dock_cam)] for p in fix.by_layer),
         )
         if fix.T_dock_cam is not None:
             line = " ".join([_seconds(fix.t_ns), *_pose_fields(fix.T_dock_cam)])
@@ -88,7 +89,16 @@ class RunFolder:
 
 
 def _fix_row(fix: Fix, latency_us: int | None, t_ns: int | None) -> list[object]:
-    head = [fix.frame, "" if t_ns is None else t_ns, int(fix.valid), 0, fix.status, fix.stage, fix.n_seen, fix.n_used]
+    head = [
+        fix.frame,
+        "" if t_ns is None else t_ns,
+        int(fix.valid),
+        0,
+        fix.status,
+        fix.stage,
+        fix.n_seen,
+        fix.n_used,
+    ]
     pose, bearing = [""] * 7, [""] * 3
     if fix.T_dock_cam is not None:
         pose = _pose_fields(fix.T_dock_cam)

@@ -60,7 +60,13 @@ def _open_folder(path: Path, fps: float | None) -> Source:
         if detections.exists():
             spots = _read_detections(detections)
             return Source(
-                path, "detections", lambda: _detections(rows, spots), len(rows), camera, station, (stamps, detections)
+                path,
+                "detections",
+                lambda: _detections(rows, spots),
+                len(rows),
+                camera,
+                station,
+                (stamps, detections),
             )
         return Source(path, "sequence", lambda: _sequence(path, rows), len(rows), camera, station, (stamps,))
     pictures = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
@@ -96,7 +102,12 @@ def _sequence(folder: Path, rows: list[dict[str, str]]) -> Iterator[Item]:
     for row in rows:
         name, t_ns = row["frame"], _stamp(row["t_ns"])
         if t_ns is None:
-            yield Unusable(name, None, "bad_stamp", f"frame {name}: stamp {row['t_ns']!r} is not an integer of nanoseconds")
+            yield Unusable(
+                name,
+                None,
+                "bad_stamp",
+                f"frame {name}: stamp {row['t_ns']!r} is not an integer of nanoseconds",
+            )
             continue
         try:
             yield Frame(name, t_ns, read_image(_inside(folder / "frames", row["file"])))
@@ -123,7 +134,12 @@ def _detections(rows: list[dict[str, str]], spots: dict[str, list[dict[str, str]
     for row in rows:
         name, t_ns = row["frame"], _stamp(row["t_ns"])
         if t_ns is None:
-            yield Unusable(name, None, "bad_stamp", f"frame {name}: stamp {row['t_ns']!r} is not an integer of nanoseconds")
+            yield Unusable(
+                name,
+                None,
+                "bad_stamp",
+                f"frame {name}: stamp {row['t_ns']!r} is not an integer of nanoseconds",
+            )
             continue
         try:
             yield _frame_detections(name, t_ns, spots.get(name, []))
@@ -142,7 +158,13 @@ def _frame_detections(name: str, t_ns: int, rows: list[dict[str, str]]) -> Detec
         raise ValueError("a centre is not a finite number")
     nan = float("nan")
     return Detections(
-        name, t_ns, uv, column("radius_px", nan), column("flux", nan), column("p_light", 1.0), column("p_rear", nan)
+        name,
+        t_ns,
+        uv,
+        column("radius_px", nan),
+        column("flux", nan),
+        column("p_light", 1.0),
+        column("p_rear", nan),
     )
 
 
