@@ -118,9 +118,8 @@ def _fold_of(model: str, distortion: Array) -> float:
     num, den, p1, p2 = _rational_terms(distortion)
     r = np.tan(np.linspace(0.0, np.pi / 2, _FOLD_STEPS, endpoint=False))
     with np.errstate(all="ignore"):  # absurd coefficients overflow, and fail the comparison
-        D = _horner(den, r * r)
         g, dg = _radial(num, den, r * r)
-        sound = (D > 0.0) & (np.minimum(g, g + 2.0 * r * r * dg) > 6.0 * np.hypot(p1, p2) * r)
+        sound = np.minimum(g, g + 2.0 * r * r * dg) > 6.0 * np.hypot(p1, p2) * r  # beyond a pole g is negative
     return _last_before(~sound, r)
 
 

@@ -63,19 +63,19 @@ class LayerLocalizer:
             return None
         named = registration.light >= 0
         lights_xy = self.p_dock[registration.light[named], :2]
-        if not consistent(lights_xy, self._plane(uv)[named], self.config.consistency):
+        if not consistent(lights_xy, self.plane(uv)[named], self.config.consistency):
             return None
         self.registration = registration
         return registration.light
 
     def register(self, uv: Array) -> pso.Registration | None:
         """The swarm's answer alone, unfiltered; None where the lens model cannot place a spot."""
-        xy = self._plane(uv)
+        xy = self.plane(uv)
         if not np.isfinite(xy).all():
             return None
         return pso.register(xy, self.p_dock[:, :2], self.registration, self.config.pso, self._rng)
 
-    def _plane(self, uv: Array) -> Array:
+    def plane(self, uv: Array) -> Array:
         """Undistorted image coordinates (N, 2) with y up, as the lights have it."""
         ray = self.camera.unproject(uv)
         return np.asarray(ray[:, :2] / ray[:, 2:] * [1.0, -1.0])

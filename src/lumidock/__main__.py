@@ -1,0 +1,6 @@
+"""`python -m lumidock`."""
+
+from lumidock.cli import main
+
+if __name__ == "__main__":
+    main()
