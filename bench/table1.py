@@ -9,6 +9,7 @@ from __future__ import annotations
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
+from multiprocessing import get_context
 
 import numpy as np
 
@@ -83,7 +84,7 @@ def _count(counts: Counts, frame: SpotFrame, alone: LayerLocalizer, whole: Paper
 
 def condition(missing: int, spurious: int, trials: int = TRIALS, first_seed: int = FIRST_SEED) -> Counts:
     """All trials of one condition, on all cores."""
-    with ProcessPoolExecutor() as pool:
+    with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
         job = partial(trial, missing, spurious)
         return sum(pool.map(job, range(first_seed, first_seed + trials)), Counts())
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from bench.shipped import shipped_camera, shipped_station
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.shipped import shipped_camera, shipped_station
 from lumidock.config import ConsistencyConfig, LayersConfig, PsoConfig
 from lumidock.datatypes import Detections, Frame, LayerPose
 from lumidock.paper.consistency import consistent

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,9 +14,10 @@ from importlib.metadata import version
 from importlib.resources import files
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any
+from types import FrameType
+from typing import Annotated, Any, NoReturn
 
-import click
+import cv2
 import typer
 from rich.console import Console
 from rich.progress import (
@@ -32,62 +36,92 @@ from lumidock.errors import InputError, LumidockError
 from lumidock.station import load_station
 from lumidock.streams.sources import Item, Source, open_source
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 _DEFAULT_STATION, _DEFAULT_CAMERA = "cage-2x2x5", "imx264-60deg"
+_SIMULATED = ("frames", "detections.csv", "timestamps.csv", "lights_truth.csv", "spurious_truth.csv")
 
-Out = Annotated[Path, typer.Option("--out", help="Folder to write; refused when it exists, unless --force.")]
+Out = Annotated[
+    Path, typer.Option("--out", metavar="DIR", help="Folder to write; refused when it exists, unless --force.")
+]
 Force = Annotated[bool, typer.Option("--force", help="Write into an existing folder, replacing earlier results.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
-StationOption = Annotated[str | None, typer.Option("--station", help="Station file, or the name of a shipped one.")]
-CameraOption = Annotated[str | None, typer.Option("--camera", help="camera_info file, or the name of a shipped one.")]
+StationOption = Annotated[
+    str | None, typer.Option("--station", metavar="FILE", help="Station file, or the name of a shipped one.")
+]
+CameraOption = Annotated[
+    str | None, typer.Option("--camera", metavar="FILE", help="camera_info file, or the name of a shipped one.")
+]
+Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from it.")]
 
 
 def main() -> None:
     """Entry point: every error that is the user's to mend is one line and exit code 2."""
+    _keep_streams_clean()
     try:
-        app(standalone_mode=False)
-    except click.exceptions.NoArgsIsHelpError as error:
-        print(error.format_message())
-        sys.exit(2)
-    except click.ClickException as error:
+        code = app(standalone_mode=False)
+        print(end="", flush=True)
+    except typer.TyperException as error:
         _fail(error.format_message())
-    except (click.exceptions.Abort, KeyboardInterrupt):
+    except (typer.Abort, KeyboardInterrupt):
         sys.exit(130)
     except LumidockError as error:
         _fail(str(error))
+    except BrokenPipeError:  # whoever read our output has left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except OSError as error:
         _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
+    sys.exit(code or 0)
 
 
-def _fail(text: str) -> None:
+def _keep_streams_clean() -> None:
+    """Let any file name be printed, and the libraries below us not print at all."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
+def _fail(text: str) -> NoReturn:
     print(f"lumidock: {' '.join(text.split())}", file=sys.stderr)
     sys.exit(2)
 
 
 @app.callback(invoke_without_command=True)
 def _lumidock(
+    context: typer.Context,
     show_version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
 ) -> None:
     """Where a vehicle is relative to its dock, from one camera and the dock's guiding lights."""
     if show_version:
         print(version("lumidock"))
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        print(context.get_help())
 
 
 @app.command("run")
 def _run(
-    source: Annotated[Path, typer.Argument(help="Sequence folder, image folder (with --fps) or video file.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="Sequence folder, image folder (with --fps) or video file.")
+    ],
     out: Out,
     station: StationOption = None,
     camera: CameraOption = None,
-    method: Annotated[str, typer.Option(help="paper")] = "paper",
+    method: Annotated[str, typer.Option(metavar="NAME", help="paper: the method of the paper.")] = "paper",
     cold: Annotated[bool, typer.Option("--cold", help="Forget all history before each frame.")] = False,
-    fps: Annotated[float | None, typer.Option(help="Frame rate, for sources without time stamps.")] = None,
-    config: Annotated[Path | None, typer.Option(help="YAML file of settings that differ from the defaults.")] = None,
+    fps: Annotated[
+        float | None, typer.Option(metavar="F", help="Frames per second, for sources without time stamps.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="YAML file of settings that differ from the defaults.")
+    ] = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find the pose of the camera in the dock frame in every frame of SOURCE."""
+    """Find the camera's pose in every frame of SOURCE."""
     from lumidock.paper import PaperLocalizer
     from lumidock.run import Setup
     from lumidock.run import run as run_source
@@ -95,23 +129,26 @@ def _run(
 
     if method != "paper":
         raise InputError(f"--method {method}: there is paper")
-    if fps is not None and not 0.0 < fps < 1e6:
-        raise InputError(f"--fps {fps:g}: wanted a positive frame rate")
     opened = open_source(source, fps)
     station_file = _file("station", station, opened.station, opened)
     camera_file = _file("camera", camera, opened.camera, opened)
     settings = load_config(config) if config else Config()
     dock = load_station(station_file)
     localizer = PaperLocalizer(dock, load_camera(camera_file), settings.paper, cold=cold)
+    if out.is_dir() and source.is_dir() and out.samefile(source):
+        raise InputError(f"{out}: is the source; write the run elsewhere")
     _prepare(out, force)
     setup = Setup(method, cold, settings, station_file, camera_file)
-    with RunFolder(out, dock.ids) as folder, _progress("run") as progress:
+    with RunFolder(out, dock.ids) as folder, _progress("run") as progress, _interrupts_held() as let_interrupt:
         _copy(station_file, out / "station.yaml")
         _copy(camera_file, out / "camera.yaml")
         done = count(1)
-        summary = run_source(
-            opened, localizer, folder, setup, on_fix=lambda _item, _fix: progress(next(done), opened.count)
-        )
+
+        def on_fix(_item: Item, _fix: Fix) -> None:
+            progress(next(done), opened.count)
+            let_interrupt()
+
+        summary = run_source(opened, localizer, folder, setup, on_fix=on_fix)
     counts = summary.as_dict()
     if as_json:
         print(json.dumps(counts, indent=2))
@@ -123,10 +160,12 @@ def _run(
 
 @app.command("sim")
 def _sim(
-    scenario: Annotated[str, typer.Argument(help="A shipped scenario (approach, trials, rectangle) or a .yaml file.")],
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="approach, trials, rectangle or a .yaml file.")],
     out: Out,
-    seed: Annotated[int, typer.Option(min=0, help="Everything random follows from it.")] = 0,
-    settings: Annotated[list[str] | None, typer.Option("--set", help="key.subkey=value; may be repeated.")] = None,
+    seed: Seed = 0,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY.SUBKEY=VALUE", help="May be repeated.")
+    ] = None,
     detections: Annotated[bool, typer.Option("--detections", help="Bare detections, without rendering.")] = False,
     station: StationOption = None,
     camera: CameraOption = None,
@@ -140,7 +179,7 @@ def _sim(
     station_file = _shipped_or_path("station", station or _DEFAULT_STATION)
     dock = load_station(station_file)
     lens = load_camera(_shipped_or_path("camera", camera or _DEFAULT_CAMERA))
-    _prepare(out, force, remove=("frames", "detections.csv"))
+    _prepare_sequence(out, force)
     _copy(station_file, out / "station.yaml")
     if detections:
         frames = write_detections(loaded, dock, lens, seed, out)
@@ -169,7 +208,7 @@ def _eval(
 @app.command("demo")
 def _demo(
     out: Out = Path("demo-out"),
-    seed: Annotated[int, typer.Option(min=0, help="Everything random follows from it.")] = 0,
+    seed: Seed = 0,
     force: Force = False,
 ) -> None:
     """Simulate a docking, run it, and leave files and pictures to look at."""
@@ -185,7 +224,7 @@ def _demo(
 
     _prepare(out, force)
     sequence, run_folder = out / "sequence", out / "run"
-    _prepare(sequence, True, remove=("frames",))
+    _prepare_sequence(sequence, True)
     scenario = load_scenario("approach")
     station_file, camera_file = (
         _shipped_or_path("station", _DEFAULT_STATION),
@@ -201,12 +240,14 @@ def _demo(
     with (
         RunFolder(run_folder, dock.ids) as folder,
         _progress("localizing") as progress,
+        _interrupts_held() as let_interrupt,
         Album(dock, lens, video, 1.0 / scenario.path.frame_interval_s) as album,
     ):
 
         def on_fix(item: Item, fix: Fix) -> None:
             album.add(item, fix)
             progress(len(album.fixes), source.count)
+            let_interrupt()
 
         _copy(station_file, run_folder / "station.yaml")
         _copy(camera_file, run_folder / "camera.yaml")
@@ -230,27 +271,63 @@ def _file(kind: str, given: str | None, beside: Path | None, source: Source) -> 
 def _shipped_or_path(kind: str, name: str) -> Path:
     """A file, or what the package ships under that name."""
     shipped = Path(str(files("lumidock"))) / f"{kind}s" / f"{name}.yaml"
-    return shipped if "/" not in name and shipped.exists() else Path(name)
+    path = shipped if "/" not in name and shipped.exists() else Path(name)
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: not a file")  # a pipe could be read once only, and a run reads it thrice
+    return path
 
 
 def _copy(source: Path, target: Path) -> None:
     if source.resolve() != target.resolve():
+        target.unlink(missing_ok=True)  # a link, not what it points to
         shutil.copyfile(source, target)
 
 
-def _prepare(folder: Path, force: bool, *, remove: tuple[str, ...] = ()) -> None:
-    """Make an output folder; an existing one only with `force`, cleared of the entries that would mislead."""
+def _prepare(folder: Path, force: bool) -> None:
+    """Make an output folder; an existing one only with `force`."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file")
     if folder.exists() and not force:
         raise InputError(f"{folder}: exists; give --force to write into it")
     folder.mkdir(parents=True, exist_ok=True)
-    for name in remove:
+
+
+def _prepare_sequence(folder: Path, force: bool) -> None:
+    """Make a folder for a simulated sequence, or clear one; frames that were not simulated are left alone."""
+    truth = folder / "truth.csv"
+    found = [name for name in (*_SIMULATED, "camera.yaml", "station.yaml") if (folder / name).exists()]
+    if force and found and not truth.exists():
+        raise InputError(f"{folder}: has {found[0]} but no truth.csv, so it was not simulated; write elsewhere")
+    _prepare(folder, force)
+    for name in _SIMULATED:
         stale = folder / name
-        if stale.is_dir():
+        if stale.is_dir() and not stale.is_symlink():
             shutil.rmtree(stale)
         else:
             stale.unlink(missing_ok=True)
+    truth.write_bytes(b"")  # marks the folder as simulated, also when the simulation is cut short
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[Callable[[], None]]:
+    """Hold Ctrl-C, but not a second one, until the callback that this yields: compiled code cannot be left half-way."""
+    before = signal.getsignal(signal.SIGINT)
+    held: list[int] = []
+
+    def hold(number: int, _frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, before)
+        held.append(number)
+
+    def let_interrupt() -> None:
+        if held:
+            raise KeyboardInterrupt
+
+    if before is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, hold)
+    try:
+        yield let_interrupt
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections import Counter
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def true_poses(truth: Path) -> dict[str, Array]:
     Raises: InputError, one line.
     """
     path = truth / "truth.csv" if truth.is_dir() else truth
-    return {row["frame"]: _pose(row) for row in _rows(path, ("frame", *_POSE))}
+    return {row["frame"]: _pose(path, row) for row in _rows(path, ("frame", *_POSE))}
 
 
 def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
@@ -36,31 +37,31 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
     Errors are in dock axes: lateral hypot(x, y), axial |z|, angle the total rotation. Raises: InputError, one line.
     """
     folder = truth if truth.is_dir() else truth.parent
-    true = true_poses(truth)
-    fixes = _rows(run_folder / "fixes.csv", ("frame", "t_ns", "valid", "reason", *_POSE))
+    true, path = true_poses(truth), run_folder / "fixes.csv"
+    fixes = _rows(path, ("frame", "t_ns", "valid", "reason", *_POSE))
     if fixes and not any(row["frame"] in true for row in fixes):
         raise InputError(f"{truth}: knows none of the run's frames")
-    found = {row["frame"]: _pose(row) for row in fixes if row["valid"] == "1"}
-    common = [name for name in found if name in true]
-    errors = np.array([_error(found[name], true[name]) for name in common]).reshape(-1, 3)
+    found = [(row["frame"], _pose(path, row)) for row in fixes if row["valid"] == "1"]
+    common = [name for name, _ in found if name in true]
+    errors = np.array([_error(T, true[name]) for name, T in found if name in true]).reshape(-1, 3)
     result: dict[str, Any] = {
         "frames": len(fixes),
         "valid": len(found),
         "reasons": dict(Counter(row["reason"] for row in fixes if row["reason"])),
         "error": _error_summary(errors),
         "by_true_z": _by_range(true, common, errors),
-        "longest_gap_s": _longest_gap_s(fixes),
+        "longest_gap_s": _longest_gap_s(path, fixes),
     }
     if (run_folder / "layers.csv").exists():
         result["layers"] = _layers(run_folder, true)
     if (folder / "lights_truth.csv").exists():
-        result["labels"] = _labels(run_folder, folder)
+        result["labels"] = _labels(run_folder, folder, true)
     return result
 
 
 def _rows(path: Path, columns: tuple[str, ...]) -> list[Row]:
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, restval="")
             missing = [name for name in columns if name not in (reader.fieldnames or ())]
             if missing:
@@ -70,14 +71,23 @@ def _rows(path: Path, columns: tuple[str, ...]) -> list[Row]:
         raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
 
 
-def _pose(row: Row) -> Array:
+def _numbers(path: Path, row: Row, names: tuple[str, ...]) -> Array:
+    """Fields of a row of `path`, all of them finite."""
     try:
-        values = np.array([float(row[name]) for name in _POSE])
-        if not np.isfinite(values).all():
-            raise ValueError("a number is not finite")
+        values = np.array([float(row[name]) for name in names])
+    except ValueError as error:
+        raise InputError(f"{path}: frame {row['frame']}: {error}") from None
+    if not np.isfinite(values).all():
+        raise InputError(f"{path}: frame {row['frame']}: a number is not finite")
+    return values
+
+
+def _pose(path: Path, row: Row) -> Array:
+    values = _numbers(path, row, _POSE)
+    try:
         return pose_from_quat(values[:3], values[3:])
     except ValueError as error:
-        raise InputError(f"frame {row['frame']}: no pose: {error}") from None
+        raise InputError(f"{path}: frame {row['frame']}: {error}") from None
 
 
 def _error(T_dock_cam: Array, T_dock_cam_true: Array) -> tuple[float, float, float]:
@@ -103,9 +113,10 @@ def _by_range(true: dict[str, Array], common: list[str], errors: Array) -> list[
     """Availability and errors over bins of true z."""
     z_all, z_found = (np.array([true[name][2, 3] for name in names]) for names in (true, common))
     table = []
-    for low, high in zip(_RANGE_BINS_M[:-1], _RANGE_BINS_M[1:], strict=True):
-        frames = int(((z_all >= low) & (z_all < high)).sum())
-        inside = (z_found >= low) & (z_found < high)
+    for low, high in pairwise(_RANGE_BINS_M):
+        top = high + (high == _RANGE_BINS_M[-1]) * 1e-9  # the last range holds its upper end as well
+        frames = int(((z_all >= low) & (z_all < top)).sum())
+        inside = (z_found >= low) & (z_found < top)
         if frames:
             table.append(
                 {"z_m": [low, high], "frames": frames, "valid": int(inside.sum())} | _error_summary(errors[inside])
@@ -113,30 +124,36 @@ def _by_range(true: dict[str, Array], common: list[str], errors: Array) -> list[
     return table
 
 
-def _longest_gap_s(fixes: list[Row]) -> float | None:
+def _longest_gap_s(path: Path, fixes: list[Row]) -> float | None:
     """Longest time between two valid fixes in a row, from the first to the last one."""
-    stamps = np.array([int(row["t_ns"]) for row in fixes if row["valid"] == "1"])
-    return float(np.diff(stamps).max() * 1e-9) if len(stamps) > 1 else None
+    try:
+        stamps = [int(row["t_ns"]) for row in fixes if row["valid"] == "1"]
+    except ValueError as error:
+        raise InputError(f"{path}: t_ns: {error}") from None
+    return max((b - a for a, b in pairwise(stamps)), default=0) * 1e-9 if len(stamps) > 1 else None
 
 
 def _layers(run_folder: Path, true: dict[str, Array]) -> dict[str, Any]:
     """First and last true z of each layer's fixes, and the offset between the layers where both gave one."""
     poses: dict[str, dict[str, Array]] = {}
-    for row in _rows(run_folder / "layers.csv", ("frame", "layer", *_POSE)):
+    path, station_file = run_folder / "layers.csv", run_folder / "station.yaml"
+    for row in _rows(path, ("frame", "layer", *_POSE)):
         if row["frame"] in true:
-            poses.setdefault(row["layer"], {})[row["frame"]] = _pose(row)
+            poses.setdefault(row["layer"], {})[row["frame"]] = _pose(path, row)
     result: dict[str, Any] = {}
     for layer, by_frame in poses.items():
         z = [float(true[name][2, 3]) for name in by_frame]
         result[layer] = {"fixes": len(z), "first_z_m": z[0], "last_z_m": z[-1]}
-    if len(poses) == 2 and (run_folder / "station.yaml").exists():
-        result["offset_m"] = layer_offset_m(load_station(run_folder / "station.yaml"), poses)
+    station = load_station(station_file) if station_file.exists() else None
+    if station is not None and len(poses) == 2 and set(poses) == set(station.layers):
+        result["offset_m"] = layer_offset_m(station, poses)
     return result
 
 
 def layer_offset_m(station: Station, poses: dict[str, dict[str, Array]]) -> float | None:
-    """Largest distance in `cam` x, y between the dock's axis at the front layer's depth, placed by the front pose, and at
-    the rear layer's depth, placed by the rear pose; None without a frame that has both. Source: paper section 4.2.
+    """Largest distance in `cam` x, y between the two places that the layers' poses give the dock's axis.
+
+    Each pose places the axis at its own layer's depth; None without a frame that has both. Source: paper section 4.2.
     """
     front, rear = station.layers_front_to_rear()
     centers = {name: np.array([0.0, 0.0, station.p_dock[station.lights_of(name), 2].mean()]) for name in (front, rear)}
@@ -149,18 +166,17 @@ def layer_offset_m(station: Station, poses: dict[str, dict[str, Array]]) -> floa
     return max(offsets, default=None)
 
 
-def _labels(run_folder: Path, truth_folder: Path) -> dict[str, int]:
-    """Named detections, and those whose light did not make them."""
-    columns = ("frame", "light", "u_px", "v_px")
-    true = {
-        (row["frame"], row["light"]): np.array([float(row["u_px"]), float(row["v_px"])])
-        for row in _rows(truth_folder / "lights_truth.csv", (*columns, "visible"))
+def _labels(run_folder: Path, truth_folder: Path, true: dict[str, Array]) -> dict[str, int]:
+    """Named detections of the frames that the truth knows, and those whose light did not make them."""
+    truth_path, path, pixel = truth_folder / "lights_truth.csv", run_folder / "lights.csv", ("u_px", "v_px")
+    lights = {
+        (row["frame"], row["light"]): _numbers(truth_path, row, pixel)
+        for row in _rows(truth_path, ("frame", "light", *pixel, "visible"))
         if row["visible"] == "1"
     }
-    named = [row for row in _rows(run_folder / "lights.csv", columns) if row["light"]]
+    named = [row for row in _rows(path, ("frame", "light", *pixel)) if row["light"] and row["frame"] in true]
     wrong = 0
     for row in named:
-        at = true.get((row["frame"], row["light"]))
-        distance = np.inf if at is None else np.hypot(*(at - [float(row["u_px"]), float(row["v_px"])]))
-        wrong += bool(distance > _SAME_SPOT_PX)
+        at, seen = lights.get((row["frame"], row["light"])), _numbers(path, row, pixel)
+        wrong += at is None or bool(np.hypot(*(at - seen)) > _SAME_SPOT_PX)
     return {"named": len(named), "wrong": wrong}

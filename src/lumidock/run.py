@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from lumidock.config import Config
-from lumidock.datatypes import Detections, Fix, Frame, Unusable
+from lumidock.datatypes import Detections, Fix, Frame, Stage, Unusable
 from lumidock.errors import FrameError, InputError
 from lumidock.streams.runfolder import RunFolder, sha256
 from lumidock.streams.sources import Item, Source
@@ -90,56 +90,59 @@ def run(
     folder: RunFolder,
     setup: Setup,
     *,
-    on_fix: Callable[[Item, Fix], None] = lambda item, fix: None,
+    on_fix: Callable[[Item, Fix], None] = lambda _item, _fix: None,
 ) -> Summary:
     """Process all of a source and describe the run, also when it is interrupted.
 
     Raises: InputError when not one row could be used.
     """
-    summary = Summary()
-    folder.describe(_description(source, setup, summary))
+    summary, identity = Summary(), _identity(source, setup)
+    folder.describe(identity | {"counts": summary.as_dict()})
+    stage: Stage = "search"
     try:
         for item in source.items():
-            fix, latency_us, error = _process(localizer, item)
+            fix, latency_us, error = _process(localizer, item, "search" if setup.cold else stage)
+            stage = fix.stage
             folder.add(fix, latency_us, t_ns=item.t_ns)
             summary.count(fix, latency_us, error)
             on_fix(item, fix)
         summary.finished = True
     finally:
-        folder.describe(_description(source, setup, summary))
+        folder.describe(identity | {"counts": summary.as_dict()})
     if not summary.usable:
         raise InputError(summary.first_error or f"{source.path}: no frame in it")
     return summary
 
 
-def _process(localizer: TwoDoors, item: Item) -> tuple[Fix, int | None, str]:
-    """Fix of one item, its latency in microseconds, and what was wrong with it."""
+def _process(localizer: TwoDoors, item: Item, stage: Stage) -> tuple[Fix, int | None, str]:
+    """Fix of one item, its latency in microseconds, and what was wrong with it; `stage` holds while a frame is lost."""
     if isinstance(item, Unusable):
-        return _unusable(item.frame, item.t_ns or 0, item.reason), None, item.text
+        return _unusable(item.frame, item.t_ns or 0, stage, item.reason), None, item.text
     start = time.perf_counter_ns()
     try:
         fix = localizer.process(item) if isinstance(item, Frame) else localizer.process_detections(item)
     except FrameError as error:
         name = item.name if isinstance(item, Frame) else item.frame
-        return _unusable(name, item.t_ns, error.reason), None, str(error)
+        return _unusable(name, item.t_ns, stage, error.reason), None, str(error)
     error_text = (
         f"frame {fix.frame}: stamp {fix.t_ns} does not follow the one before" if fix.reason == "bad_stamp" else ""
     )
     return fix, (time.perf_counter_ns() - start) // 1000, error_text
 
 
-def _unusable(frame: str, t_ns: int, reason: str) -> Fix:
-    return Fix(frame, t_ns, "none", "search", reason=reason)
+def _unusable(frame: str, t_ns: int, stage: Stage, reason: str) -> Fix:
+    return Fix(frame, t_ns, "none", stage, reason=reason)
 
 
-def _description(source: Source, setup: Setup, summary: Summary) -> dict[str, Any]:
-    inputs = {path.name: sha256(path) for path in (*source.inputs, setup.station, setup.camera)}
+def _identity(source: Source, setup: Setup) -> dict[str, Any]:
+    """What the run was made from and with; the station and the camera under the names their copies have."""
+    inputs = {path.name: path for path in source.inputs}
+    inputs |= {"station.yaml": setup.station, "camera.yaml": setup.camera}
     return {
         "lumidock": version("lumidock"),
         "method": setup.method,
         "cold": setup.cold,
         "source": {"kind": source.kind, "name": source.path.name},
-        "inputs_sha256": inputs,
+        "inputs_sha256": {name: sha256(path) for name, path in inputs.items()},
         "config": setup.config.model_dump(mode="json"),
-        "counts": summary.as_dict(),
     }

@@ -8,7 +8,7 @@ import numpy as np
 
 from lumidock.camera import Camera
 from lumidock.config import PaperConfig
-from lumidock.datatypes import Array, Indices, LayerPose, MatchSource
+from lumidock.datatypes import Array, Indices, LayerPose, MatchSource, Status
 from lumidock.paper import btekf, pso
 from lumidock.paper.consistency import consistent
 from lumidock.pose import reprojection_rms_px, sqpnp
@@ -19,11 +19,15 @@ MIN_FOR_SWARM = 4  # lights of a layer, section 1, contribution (2)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LayerAnswer:
-    """The light of each spot (N,), -1 for none, as indices into the station; and a pose or the reason against one."""
+    """The light of each spot (N,), -1 for none, as indices into the station; and a pose or the reason against one.
+
+    `status` says whether history took part in the pose.
+    """
 
     light: Indices
     pose: LayerPose | None
     reason: str = ""
+    status: Status = "none"
 
 
 class LayerLocalizer:
@@ -89,13 +93,14 @@ class LayerLocalizer:
         T_dock_cam = self._solve(p_dock, pixels, track)
         if T_dock_cam is None:
             return self._nothing(uv, "residual")
+        status: Status = "acquired" if track is None else "tracking"
         if source == "pso" and track is not None:
             track = btekf.update(track, self.camera, p_dock, pixels, self.config.btekf)
         if track is None or not self._reprojects(track.T_dock_cam, p_dock, pixels):
             track = btekf.start(t_ns, T_dock_cam, self.camera, p_dock, self.config.btekf)
         self.track = track
         pose = LayerPose(self.layer, T_dock_cam, int(named.sum()), source)
-        return LayerAnswer(np.where(named, self.lights[light], -1), pose)
+        return LayerAnswer(np.where(named, self.lights[light], -1), pose, status=status)
 
     def _solve(self, p_dock: Array, uv: Array, track: btekf.Track | None) -> Array | None:
         """SQPnP; with three lights, which leave it several solutions, the filter's pose."""

@@ -53,7 +53,6 @@ class PaperLocalizer:
         last, self._last_t_ns = self._last_t_ns, detections.t_ns
         if last is not None and detections.t_ns <= last:
             return self._no_fix(detections, "bad_stamp")
-        tracked = {layer.layer for layer in self._layers if layer.track is not None}
         light, answers = self._locate(detections)
         poses = {answer.pose.layer: answer.pose for answer in answers if answer.pose is not None}
         guide = self._guidance.choose(poses)
@@ -62,7 +61,7 @@ class PaperLocalizer:
         return Fix(
             detections.frame,
             detections.t_ns,
-            "tracking" if guide.layer in tracked else "acquired",
+            next(answer.status for answer in answers if answer.pose is guide),
             self._guidance.stage,
             n_seen=len(detections),
             n_used=guide.n_used,

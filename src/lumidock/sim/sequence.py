@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -59,7 +60,8 @@ def write_rendered(
     t_ns, poses = trajectory(scenario, np.random.default_rng([seed, 0]))
     (out / "frames").mkdir(parents=True, exist_ok=True)
     job = partial(_write_frame, scenario, station, camera, seed, out)
-    with ProcessPoolExecutor(workers or os.cpu_count()) as pool:
+    spawn = get_context("spawn")  # a fork would inherit the locks of OpenCV's threads
+    with ProcessPoolExecutor(workers or os.cpu_count(), mp_context=spawn) as pool:
         rows = []
         for row in pool.map(job, range(len(t_ns)), chunksize=4):
             rows.append(row)

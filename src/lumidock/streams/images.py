@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import stat
 import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -14,17 +16,22 @@ from lumidock.errors import FrameError
 SUFFIXES = (".png", ".jpg", ".jpeg")
 _MAX_BYTES = 1 << 28
 _MAX_PIXELS = 100_000_000
-_SIZE_MARKERS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
+_PNG = b"\x89PNG\r\n\x1a\n"
+_SIZE_MARKERS, _SCAN = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}, 0xDA
+_END = b"\xff\xd9"
 
 
 def read_image(path: Path) -> Image:
-    """Read a PNG or JPEG as (H, W) mono8 or (H, W, 3) bgr8.
+    """Read a PNG or JPEG as (H, W) mono8 or, where it has colour, (H, W, 3) bgr8.
 
-    The header is read before any pixel and the end marker must be there: the decoder returns whole pictures from half
+    The header is read before any pixel, and the file must be complete: the decoder returns whole pictures from half
     files. Raises: FrameError `bad_frame`, one line.
     """
     try:
-        if path.stat().st_size > _MAX_BYTES:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise _bad(path, "not a file")  # a pipe would keep the run waiting
+        if status.st_size > _MAX_BYTES:
             raise _bad(path, "too large")
         data = path.read_bytes()
     except OSError as error:
@@ -38,7 +45,19 @@ def read_image(path: Path) -> Image:
         image = None
     if image is None:
         raise _bad(path, "cannot be decoded")
-    return np.asarray(image, np.uint8)
+    return mono_if_gray(np.asarray(image, np.uint8))
+
+
+def mono_if_gray(image: Image, *, tint: int = 0) -> Image:
+    """A picture (H, W, 3) as (H, W) when its channels differ by at most `tint`: a mono camera's, saved as colour."""
+    if image.ndim == 3 and _is_gray(image[::16, ::16], tint) and _is_gray(image, tint):
+        return np.ascontiguousarray(image[:, :, 1])
+    return image
+
+
+def _is_gray(image: Image, tint: int) -> bool:
+    blue, green, red = cv2.split(image)
+    return max(int(cv2.absdiff(blue, green).max()), int(cv2.absdiff(green, red).max())) <= tint
 
 
 def _bad(path: Path, why: str) -> FrameError:
@@ -46,25 +65,37 @@ def _bad(path: Path, why: str) -> FrameError:
 
 
 def _size_in_header(path: Path, data: bytes) -> tuple[int, int]:
-    if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) > 24:
-        if b"IEND" not in data[-64:]:
-            raise _bad(path, "truncated PNG")
-        width, height = struct.unpack(">II", data[16:24])
-        return width, height
+    if data.startswith(_PNG):
+        return _png_size(path, data)
     if data.startswith(b"\xff\xd8"):
-        if not data.rstrip(b"\0\r\n ").endswith(b"\xff\xd9"):
-            raise _bad(path, "truncated JPEG")
         return _jpeg_size(path, data)
     raise _bad(path, "empty file" if not data else "neither PNG nor JPEG")
 
 
+def _png_size(path: Path, data: bytes) -> tuple[int, int]:
+    """Width and height from the header chunk, after a check of every chunk up to the last. Source: ISO 15948, 5.3."""
+    at, view = len(_PNG), memoryview(data)
+    while at + 12 <= len(data):
+        length, kind = struct.unpack(">I4s", data[at : at + 8])
+        end = at + 8 + length
+        if data[end : end + 4] != struct.pack(">I", zlib.crc32(view[at + 4 : end])):
+            raise _bad(path, "truncated or corrupt PNG")
+        if kind == b"IEND" and data[12:16] == b"IHDR":
+            width, height = struct.unpack(">II", data[16:24])
+            return width, height
+        at = end + 4
+    raise _bad(path, "truncated PNG")
+
+
 def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
-    """Width and height from the start-of-frame segment. Source: ITU-T T.81, B.2.2."""
-    at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF:
+    """Width and height from the start-of-frame segment; the scan must have an end. Source: ITU-T T.81, B.1, B.2."""
+    at, size = 2, (0, 0)
+    while at + 9 <= len(data) and data[at] == 0xFF and data[at + 1] != _SCAN:
         marker = data[at + 1]
         if marker in _SIZE_MARKERS:
             height, width = struct.unpack(">HH", data[at + 5 : at + 9])
-            return width, height
+            size = width, height
         at += 1 if marker == 0xFF else 2 + struct.unpack(">H", data[at + 2 : at + 4])[0]
-    raise _bad(path, "JPEG without a size")
+    if data.find(_END, at) < 0:  # inside a scan these two bytes mean nothing else
+        raise _bad(path, "truncated JPEG")
+    return size

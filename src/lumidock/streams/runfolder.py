@@ -1,4 +1,4 @@
-"""The run folder: fixes, lights, layers, trajectory and run.json, complete up to the last row whenever a run is killed."""
+"""The run folder: fixes, lights, layers, trajectory and run.json, whole rows only whenever a run is killed."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class RunFolder:
         )
         if fix.T_dock_cam is not None:
             line = " ".join([_seconds(fix.t_ns), *_pose_fields(fix.T_dock_cam)])
-            self._files["trajectory.tum"].write(line.encode() + b"\n")
+            self._append("trajectory.tum", f"{line}\n")
 
     def describe(self, content: dict[str, Any]) -> None:
         """Write run.json, all of it or none."""
@@ -76,8 +76,18 @@ class RunFolder:
     def _write(self, name: str, rows: Iterable[Iterable[object]]) -> None:
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(rows)
-        if text.tell():
-            self._files[name].write(text.getvalue().encode("utf-8"))
+        self._append(name, text.getvalue())
+
+    def _append(self, name: str, text: str) -> None:
+        """Write all of `text` or, on a full disk, nothing."""
+        file, content = self._files[name], text.encode("utf-8", "backslashreplace")  # a file's name need not be UTF-8
+        end = file.tell()
+        try:
+            while content:  # one write, unless the disk takes only a part
+                content = content[file.write(content) :]
+        except OSError as error:
+            file.truncate(end)
+            raise OSError(error.errno, error.strerror, str(self.folder / name)) from None
 
     def _light_rows(self, fix: Fix) -> Iterable[list[object]]:
         if fix.match is None:

@@ -1,0 +1,197 @@
+import csv
+
+import numpy as np
+import pytest
+import yaml
+from conftest import assert_close, refused
+from test_run import LIGHTS, STATION
+
+from lumidock.datatypes import Detections, Fix, LayerPose, Match
+from lumidock.geometry import quat_xyzw_from_rotation, so3_exp
+from lumidock.metrics import evaluate, layer_offset_m, true_poses
+from lumidock.station import load_station
+from lumidock.streams.runfolder import RunFolder
+
+HEAD_ON = np.diag([1.0, -1.0, -1.0])
+TRUTH = "frame,t_ns,x_m,y_m,z_m,qx,qy,qz,qw\n"
+NAMES = tuple(LIGHTS)
+
+
+def pose(x, y, z, w=(0.0, 0.0, 0.0)):
+    """T_dock_cam (4, 4) head-on at (x, y, z), turned by `w` rad in dock axes."""
+    T = np.eye(4)
+    T[:3, :3] = so3_exp(np.array(w)) @ HEAD_ON
+    T[:3, 3] = x, y, z
+    return T
+
+
+def write_truth(folder, poses):
+    """truth.csv of `poses` by frame name."""
+    folder.mkdir(exist_ok=True)
+    rows = ([name, 0, *T[:3, 3], *quat_xyzw_from_rotation(T[:3, :3])] for name, T in poses.items())
+    (folder / "truth.csv").write_text(TRUTH + "".join(",".join(map(str, row)) + "\n" for row in rows))
+
+
+def write_run(folder, poses, *, t_ns=None, layers=(), lights=None):
+    """A run folder with these poses; None is no fix. `lights` name the detections of each frame, at (10 i, 20)."""
+    with RunFolder(folder, NAMES) as run:
+        for number, (name, T) in enumerate(poses.items()):
+            light = np.array((lights or {}).get(name, []), np.int64)
+            uv = np.stack([10.0 * np.arange(len(light)), np.full(len(light), 20.0)], axis=1)
+            t = number * 10**9 if t_ns is None else t_ns[number]
+            match = Match(Detections.from_uv(name, t, uv), light)
+            status, reason = ("none", "too_few") if T is None else ("tracking", "")
+            by_layer = tuple(LayerPose(layer, T_layer, 4, "pso") for layer, T_layer in layers if T is not None)
+            fix = Fix(name, t, status, "front", T_dock_cam=T, reason=reason, match=match, by_layer=by_layer)
+            run.add(fix, 1, t_ns=t)
+
+
+@pytest.fixture
+def judge(tmp_path):
+    """Evaluate a run with poses `found` against poses `true`."""
+
+    def evaluate_poses(found, true, **options):
+        write_truth(tmp_path / "truth", true)
+        write_run(tmp_path / "run", found, **options)
+        return evaluate(tmp_path / "run", tmp_path / "truth")
+
+    return evaluate_poses
+
+
+def test_errors_are_lateral_axial_and_total_rotation(judge):
+    found = {"a": pose(0.3, 0.4, 9.5, (0.0, 0.1, 0.0)), "b": pose(0, 0, 10), "c": pose(0, 0, 10)}
+    result = judge(found, {name: pose(0, 0, 10) for name in "abc"})
+    assert_close([result["error"][name]["median"] for name in ("lateral_m", "axial_m", "angle_deg")], 0, atol=1e-6)
+    assert_close(result["error"]["lateral_m"]["p95"], 0.9 * 0.5, atol=1e-8)
+    assert_close(result["error"]["axial_m"]["p95"], 0.9 * 0.5, atol=1e-8)
+    assert_close(result["error"]["angle_deg"]["p95"], 0.9 * np.rad2deg(0.1), atol=1e-6)
+
+
+def test_every_true_frame_of_the_approach_is_in_one_range(judge):
+    true = {f"{z:g}": pose(0, 0, z) for z in np.linspace(30, -3, 67)}
+    table = judge(true | {"30": None, "8": None}, true)["by_true_z"]
+    assert [row["z_m"] for row in table] == [[-3, 0], [0, 3], [3, 8], [8, 12], [12, 18], [18, 24], [24, 30]]
+    assert [row["frames"] for row in table] == [6, 6, 10, 8, 12, 12, 13]
+    assert [row["frames"] - row["valid"] for row in table] == [0, 0, 0, 1, 0, 0, 1]
+
+
+def test_counts_reasons_and_the_longest_gap(judge):
+    found = {"a": pose(0, 0, 9), "b": None, "c": pose(0, 0, 9), "d": pose(0, 0, 9), "e": None}
+    stamps = [0, 10**9, 1795368000 * 10**9, 1795368001 * 10**9, 1795368009 * 10**9]
+    result = judge(found, {name: pose(0, 0, 9) for name in found}, t_ns=stamps)
+    assert (result["frames"], result["valid"], result["reasons"]) == (5, 3, {"too_few": 2})
+    assert_close(result["longest_gap_s"], 1795368000.0)
+
+
+def test_a_run_without_fixes_has_no_errors(judge):
+    result = judge({"a": None}, {"a": pose(0, 0, 9)})
+    assert (result["valid"], result["error"], result["longest_gap_s"], result["layers"]) == (0, {}, None, {})
+
+
+def test_a_run_that_was_killed_at_once_is_no_error(judge):
+    assert judge({}, {"a": pose(0, 0, 9)})["frames"] == 0
+
+
+def write_lights_truth(folder, rows):
+    folder.mkdir(exist_ok=True)
+    (folder / "lights_truth.csv").write_text("frame,light,u_px,v_px,visible,snr\n" + "\n".join(rows) + "\n")
+
+
+def test_a_name_is_wrong_when_its_light_is_elsewhere_or_not_visible(judge, tmp_path):
+    write_lights_truth(tmp_path / "truth", ["a,A,0,22.9,1,9", "a,B,10,23.1,1,9", "a,C,20,20,0,1"])
+    result = judge({"a": pose(0, 0, 9)}, {"a": pose(0, 0, 9)}, lights={"a": [0, 1, 2, 3, -1]})
+    assert result["labels"] == {"named": 4, "wrong": 3}
+
+
+def test_frames_that_the_truth_lacks_are_not_judged(judge, tmp_path):
+    write_lights_truth(tmp_path / "truth", ["a,A,0,20,1,9"])
+    found = {"a": pose(0, 0, 9), "b": pose(5, 5, 5)}
+    result = judge(found, {"a": pose(0, 0, 9)}, lights={"a": [0], "b": [1, 2]}, layers=[("front", pose(0, 0, 9))])
+    assert (result["frames"], result["valid"]) == (2, 2)
+    assert_close(result["error"]["lateral_m"]["p95"], 0)
+    assert result["labels"] == {"named": 1, "wrong": 0}
+    assert result["layers"]["front"]["fixes"] == 1
+
+
+def two_layers(folder):
+    content = STATION | {"lights": [*STATION["lights"], {"id": "R", "layer": "rear", "position": [0, 0, -5]}]}
+    (folder / "station.yaml").write_text(yaml.safe_dump(content))
+    return load_station(folder / "station.yaml")
+
+
+def test_the_offset_of_the_layers_is_that_of_the_docks_axis(tmp_path):
+    station = two_layers(tmp_path)
+    exact, shifted = pose(1, 2, 9), pose(1.3, 2.4, 9)
+    assert_close(layer_offset_m(station, {"front": {"a": exact}, "rear": {"a": exact}}), 0)
+    assert_close(layer_offset_m(station, {"front": {"a": exact}, "rear": {"a": shifted}}), 0.5)
+    assert layer_offset_m(station, {"front": {"a": exact}, "rear": {"b": exact}}) is None
+
+
+def test_layers_have_a_reach_and_an_offset(judge, tmp_path):
+    layers = [("front", pose(0, 0, 9)), ("rear", pose(0, 0.25, 9))]
+    (tmp_path / "run").mkdir()
+    two_layers(tmp_path / "run")
+    poses = {"a": pose(0, 0, 9), "b": pose(0, 0, 7), "c": None}
+    result = judge(poses, poses | {"c": pose(0, 0, 5)}, layers=layers)["layers"]
+    assert result["rear"] == {"fixes": 2, "first_z_m": 9.0, "last_z_m": 7.0}
+    assert_close(result["offset_m"], 0.25, atol=1e-8)
+
+
+def test_layers_of_another_station_have_no_offset(judge, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "station.yaml").write_text(yaml.safe_dump(STATION))
+    layers = [("front", pose(0, 0, 9)), ("rear", pose(0, 0, 9))]
+    assert "offset_m" not in judge({"a": pose(0, 0, 9)}, {"a": pose(0, 0, 9)}, layers=layers)["layers"]
+
+
+def test_a_truth_file_alone_will_do(tmp_path):
+    write_truth(tmp_path, {"a": pose(1, 2, 3)})
+    (tmp_path / "other.csv").write_bytes(b"\xef\xbb\xbf" + (tmp_path / "truth.csv").read_bytes())
+    assert_close(true_poses(tmp_path / "other.csv")["a"], pose(1, 2, 3))
+
+
+def spoil(name, column, value):
+    """Set a field of the first row of a CSV file below a folder; an empty `column` drops the file's header."""
+
+    def change(folder):
+        with (folder / name).open(newline="") as file:
+            rows = list(csv.reader(file))
+        if column:
+            rows[1][rows[0].index(column)] = value
+        else:
+            del rows[0]
+        with (folder / name).open("w", newline="") as file:
+            csv.writer(file).writerows(rows)
+
+    return change
+
+
+SPOILS = {
+    "no run": (lambda folder: (folder / "run" / "fixes.csv").unlink(), "run/fixes.csv: No such file"),
+    "no truth": (lambda folder: (folder / "truth" / "truth.csv").unlink(), "truth/truth.csv: No such file"),
+    "no lights": (lambda folder: (folder / "run" / "lights.csv").unlink(), "run/lights.csv: No such file"),
+    "empty run": (lambda folder: (folder / "run" / "fixes.csv").write_text(""), "run/fixes.csv: no column frame"),
+    "binary run": (lambda folder: (folder / "run" / "fixes.csv").write_bytes(bytes(range(256))), "run/fixes.csv: "),
+    "no header": (spoil("truth/truth.csv", "", ""), "truth/truth.csv: no column frame"),
+    "other frames": (spoil("truth/truth.csv", "frame", "z"), "truth: knows none"),
+    "word for a number": (spoil("run/fixes.csv", "x_m", "far"), "run/fixes.csv: frame a: could not convert"),
+    "empty number": (spoil("run/fixes.csv", "qw", ""), "run/fixes.csv: frame a: could not convert"),
+    "number not finite": (spoil("truth/truth.csv", "y_m", "inf"), "truth/truth.csv: frame a: a number is not finite"),
+    "no rotation": (spoil("truth/truth.csv", "qx", "0"), "truth/truth.csv: frame a: "),
+    "no stamp": (spoil("run/fixes.csv", "t_ns", ""), "run/fixes.csv: t_ns: "),
+    "layer without a pose": (spoil("run/layers.csv", "z_m", "?"), "run/layers.csv: frame a: "),
+    "light nowhere": (spoil("run/lights.csv", "u_px", ""), "run/lights.csv: frame a: "),
+    "light truly nowhere": (spoil("truth/lights_truth.csv", "v_px", "nan"), "truth/lights_truth.csv: frame a: "),
+}
+
+
+@pytest.mark.parametrize(("change", "match"), SPOILS.values(), ids=SPOILS)
+def test_what_cannot_be_judged_is_refused(tmp_path, change, match):
+    T = {"a": pose(0, 0, 9)}
+    write_truth(tmp_path / "truth", T)
+    write_lights_truth(tmp_path / "truth", ["a,A,0,20,1,9"])
+    write_run(tmp_path / "run", T, lights={"a": [0]}, layers=[("front", T["a"])])
+    evaluate(tmp_path / "run", tmp_path / "truth")
+    change(tmp_path)
+    with refused(tmp_path, match):
+        evaluate(tmp_path / "run", tmp_path / "truth")
