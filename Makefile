@@ -10,9 +10,9 @@ setup: $(READY)
 $(READY): requirements.lock pyproject.toml
 	@rm -rf .venv
 	@$(PYTHON) -m venv .venv
-	@if [ -n "$(UV)" ] && $(UV) pip sync --quiet --require-hashes --python $(BIN)/python requirements.lock; then :; \
-	else $(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock; fi
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@if [ -n "$(UV)" ] && $(UV) pip sync -qq --require-hashes --python $(BIN)/python requirements.lock; then :; \
+	else $(BIN)/python -m pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock; fi
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
 demo: setup

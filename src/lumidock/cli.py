@@ -59,7 +59,7 @@ def main() -> None:
     """Entry point: every error that is the user's to mend is one line and exit code 2."""
     _keep_streams_clean()
     try:
-        code = app(standalone_mode=False)
+        code = app(standalone_mode=False, prog_name="lumidock")
         print(end="", flush=True)
     except typer.TyperException as error:
         _fail(error.format_message())
@@ -254,9 +254,9 @@ def _demo(
         summary = run_source(source, PaperLocalizer(dock, lens), folder, setup, on_fix=on_fix)
     result = evaluate(run_folder, sequence)
     plot_trajectory(album.fixes, true_poses(sequence), dock, out / "trajectory.png")
-    contact_sheet(album.sheet(), out / "stages.png")
+    contact_sheet(album.sheet(), out / "stages.jpg")
     print("\n".join(summary_lines(result, summary.as_dict())))
-    print(f"look at     {out / 'trajectory.png'}, {out / 'stages.png'}, {video}, {run_folder / 'fixes.csv'}")
+    print(f"look at     {out / 'trajectory.png'}, {out / 'stages.jpg'}, {video}, {run_folder / 'fixes.csv'}")
 
 
 def _file(kind: str, given: str | None, beside: Path | None, source: Source) -> Path:

@@ -12,13 +12,12 @@ import numpy as np
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Fix, Frame, Image
-from lumidock.overlay import draw
+from lumidock.overlay import around_lights, draw, whole
 from lumidock.station import Station
 from lumidock.streams.sources import Item
 
 _WIDTH = 1224
-_PICTURE_OF_STAGE = 20  # the sheet shows this fix of each stage, or the last before it
-_SHEET_STAGES = ("search", "front", "transition", "rear")
+_PICTURE_OF_STAGE = {"search": 1, "front": 50, "transition": 60, "rear": 20}  # which fix of a stage the sheet shows
 
 
 @dataclass(slots=True)
@@ -47,17 +46,18 @@ class Album:
         self.fixes.append(fix)
         if not isinstance(item, Frame):
             return
-        picture = draw(item.image, fix, self.station, self.camera, width=_WIDTH)
+        picture = draw(item.image, fix, self.station, self.camera, whole(item.image, _WIDTH))
         if self._writer is None:
             codec = cv2.VideoWriter.fourcc(*"mp4v")
             self._writer = cv2.VideoWriter(str(self.video), codec, self.fps, (picture.shape[1], picture.shape[0]))
         self._writer.write(picture)
-        if fix.valid and sum(f.valid and f.stage == fix.stage for f in self.fixes) <= _PICTURE_OF_STAGE:
-            self.by_stage[fix.stage] = picture
+        if fix.valid and sum(f.valid and f.stage == fix.stage for f in self.fixes) <= _PICTURE_OF_STAGE[fix.stage]:
+            near = around_lights(item.image, fix, _WIDTH)
+            self.by_stage[fix.stage] = draw(item.image, fix, self.station, self.camera, near)
 
     def sheet(self) -> list[Image]:
         """One picture per stage, in the order of the approach; an even number of them."""
-        pictures = [self.by_stage[stage] for stage in _SHEET_STAGES if stage in self.by_stage]
+        pictures = [self.by_stage[stage] for stage in _PICTURE_OF_STAGE if stage in self.by_stage]
         return pictures[len(pictures) % 2 :]
 
 

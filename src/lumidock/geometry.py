@@ -1,7 +1,7 @@
 """SE(3): exponential, logarithm, inverse, adjoint, Jacobians and the transport of covariances.
 
 A tangent vector is xi = [translation m, rotation rad]; perturbations stand on the right, T_dock_cam @ se3_exp(xi).
-Source: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics", 2018 (eq. numbers below).
+Source: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics", 2018 (equation numbers).
 """
 
 from __future__ import annotations

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
 from lumidock.camera import Camera
-from lumidock.datatypes import Fix, Image
+from lumidock.datatypes import Array, Fix, Image, Match
 from lumidock.pose import project_lights
 from lumidock.station import Station
 
@@ -16,45 +18,73 @@ _TEXT = (235, 235, 235)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
-def draw(image: Image, fix: Fix, station: Station, camera: Camera, *, width: int = 1224) -> Image:
-    """A copy of the picture (H, W[, 3]), `width` wide, with detections, names, reprojected lights and the pose."""
-    scale = width / image.shape[1]
-    size = (width, round(image.shape[0] * scale))
-    canvas = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+@dataclass(frozen=True, slots=True)
+class View:
+    """The part of a picture that is shown: its top-left pixel, its size, and pixels on the canvas per pixel."""
+
+    u: int
+    v: int
+    width: int
+    height: int
+    scale: float
+
+    def at(self, uv: Array) -> tuple[int, int]:
+        """Canvas pixel of a pixel `uv` (2,)."""
+        x, y = (uv - [self.u, self.v] + 0.5) * self.scale - 0.5
+        return round(float(x)), round(float(y))
+
+
+def whole(image: Image, width: int) -> View:
+    """All of a picture, `width` wide."""
+    return View(0, 0, image.shape[1], image.shape[0], width / image.shape[1])
+
+
+def around_lights(image: Image, fix: Fix, width: int) -> View:
+    """The part of a picture around a fix's detections, in the picture's own proportions."""
+    if fix.match is None or not len(fix.match.detections):
+        return whole(image, width)
+    uv = fix.match.detections.uv
+    full = np.array([image.shape[1], image.shape[0]])
+    share = min(1.0, max(float((2.2 * np.ptp(uv, axis=0) / full).max()), 0.15))
+    size = (share * full).astype(int)
+    u, v = np.clip((uv.min(axis=0) + uv.max(axis=0)) / 2 - size / 2, 0, full - size).astype(int)
+    return View(int(u), int(v), int(size[0]), int(size[1]), width / int(size[0]))
+
+
+def draw(image: Image, fix: Fix, station: Station, camera: Camera, view: View) -> Image:
+    """A copy of a picture (H, W[, 3]), as `view` has it, with detections, names, reprojected lights and the pose."""
+    window = image[view.v : view.v + view.height, view.u : view.u + view.width]
+    size = (round(view.width * view.scale), round(view.height * view.scale))
+    canvas = cv2.resize(window, size, interpolation=cv2.INTER_AREA if view.scale < 1 else cv2.INTER_LINEAR)
     canvas = cv2.cvtColor(canvas, cv2.COLOR_GRAY2BGR) if canvas.ndim == 2 else canvas
     if fix.T_dock_cam is not None:
-        _draw_projected(canvas, project_lights(camera, fix.T_dock_cam, station.p_dock), station, scale)
+        _draw_projected(canvas, project_lights(camera, fix.T_dock_cam, station.p_dock), station, view)
     if fix.match is not None:
-        _draw_detections(canvas, fix, station, scale)
+        _draw_detections(canvas, fix.match, station, view)
     _draw_caption(canvas, fix)
     return np.asarray(canvas, np.uint8)
 
 
-def _pixel(uv: np.ndarray, scale: float) -> tuple[int, int]:
-    u, v = (uv + 0.5) * scale - 0.5
-    return round(float(u)), round(float(v))
+def _color(station: Station, light: int) -> tuple[int, int, int]:
+    return _LAYER_COLORS[int(station.layer[light]) % len(_LAYER_COLORS)] if light >= 0 else _SPURIOUS
 
 
-def _draw_projected(canvas: np.ndarray, uv: np.ndarray, station: Station, scale: float) -> None:
+def _draw_projected(canvas: np.ndarray, uv: Array, station: Station, view: View) -> None:
     """A small cross where the pose puts each light."""
-    limit = np.array(canvas.shape[1::-1]) / scale
-    for at, layer in zip(uv, station.layer, strict=True):
-        if np.isfinite(at).all() and (np.abs(at) < 2 * limit).all():
-            color = _LAYER_COLORS[int(layer) % len(_LAYER_COLORS)]
-            cv2.drawMarker(canvas, _pixel(at, scale), color, cv2.MARKER_TILTED_CROSS, 8, 1, cv2.LINE_AA)
+    for light, at in enumerate(uv):
+        if np.isfinite(at).all() and (np.abs(at) < 1e4).all():
+            cv2.drawMarker(canvas, view.at(at), _color(station, light), cv2.MARKER_TILTED_CROSS, 8, 1, cv2.LINE_AA)
 
 
-def _draw_detections(canvas: np.ndarray, fix: Fix, station: Station, scale: float) -> None:
+def _draw_detections(canvas: np.ndarray, match: Match, station: Station, view: View) -> None:
     """A ring around each detection, with its light's name; red without one."""
-    assert fix.match is not None
-    spots = fix.match.detections
-    for at, radius, light in zip(spots.uv, spots.radius_px, fix.match.light, strict=True):
-        u, v = _pixel(at, scale)
-        ring = max(9, round(1.6 * float(np.nan_to_num(radius)) * scale) + 5)
-        color = _LAYER_COLORS[int(station.layer[light]) % len(_LAYER_COLORS)] if light >= 0 else _SPURIOUS
-        cv2.circle(canvas, (u, v), ring, color, 1, cv2.LINE_AA)
+    spots = match.detections
+    for at, radius, light in zip(spots.uv, spots.radius_px, match.light, strict=True):
+        u, v = view.at(at)
+        ring = max(9, round(1.6 * float(np.nan_to_num(radius)) * view.scale) + 5)
+        cv2.circle(canvas, (u, v), ring, _color(station, light), 1, cv2.LINE_AA)
         if light >= 0:
-            _put(canvas, station.ids[light], (u + ring + 3, v - 4), color, 0.5)
+            _put(canvas, station.ids[light], (u + ring + 3, v - 4), _color(station, light), 0.5)
 
 
 def _draw_caption(canvas: np.ndarray, fix: Fix) -> None:

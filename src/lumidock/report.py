@@ -59,7 +59,10 @@ def _scatter_by_stage(axes, fixes: Sequence[Fix], value) -> None:  # type: ignor
             axes.scatter(z, [value(fix) for fix in inside], s=9, color=color, label=f"{stage} stage")
 
 
-def contact_sheet(pictures: Sequence[Image], out: Path, *, columns: int = 2) -> None:
-    """Write pictures (H, W, 3) of one size side by side into one PNG."""
-    rows = [np.hstack(pictures[i : i + columns]) for i in range(0, len(pictures) - columns + 1, columns)]
-    cv2.imwrite(str(out), np.vstack(rows))
+def contact_sheet(pictures: Sequence[Image], out: Path, *, columns: int = 2, width: int = 720) -> None:
+    """Write pictures (H, W, 3) of one size side by side into one JPEG, each `width` wide; nothing without pictures."""
+    size = (width, round(pictures[0].shape[0] * width / pictures[0].shape[1])) if pictures else (0, 0)
+    small = [np.pad(cv2.resize(p, size, interpolation=cv2.INTER_AREA), ((2, 2), (2, 2), (0, 0))) for p in pictures]
+    rows = [np.hstack(small[i : i + columns]) for i in range(0, len(small) - columns + 1, columns)]
+    if rows:
+        cv2.imwrite(str(out), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 90])
