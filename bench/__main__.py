@@ -1,8 +1,12 @@
-"""Run the benches named on the command line, or all; each leaves NAME.md and NAME.json in bench-out."""
+"""Run the benches named on the command line, or all; each leaves NAME.md and NAME.json in bench-out.
+
+With --readme each table also replaces its own in the README, between <!-- NAME --> and <!-- /NAME -->.
+"""
 
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from pathlib import Path
@@ -16,13 +20,23 @@ def main() -> None:
     """Run and print."""
     out = Path("bench-out")
     out.mkdir(exist_ok=True)
-    for name in sys.argv[1:] or BENCHES:
+    names = [name for name in sys.argv[1:] if name != "--readme"]
+    for name in names or BENCHES:
         start = time.monotonic()
         content, lines = BENCHES[name].main()
         text = "\n".join(lines)
         (out / f"{name}.md").write_text(text + "\n", encoding="utf-8")
         (out / f"{name}.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        if "--readme" in sys.argv:
+            _into_readme(name, text)
         print(f"{text}\n({name}: {time.monotonic() - start:.0f} s)\n", flush=True)
+
+
+def _into_readme(name: str, text: str) -> None:
+    """Replace one table of the README."""
+    readme = Path("README.md")
+    between = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
+    readme.write_text(between.sub(lambda m: f"{m[1]}{text}\n{m[2]}", readme.read_text()), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ def simulate_and_run(scenario: str, seed: int, folder: Path) -> tuple[Path, Path
 
 
 def search_labels(sequence: Path, out: Path) -> tuple[int, int]:
-    """Frames with four or more front lights detected and no spurious spot given to the front layer; those named right."""
+    """Frames with four or more front lights detected and no other spot taken for front; those of them named right."""
     true: dict[str, dict[str, np.ndarray]] = {}
     for row in _rows(sequence / "lights_truth.csv"):
         true.setdefault(row["frame"], {})[row["light"]] = np.array([float(row["u_px"]), float(row["v_px"])])

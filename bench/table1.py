@@ -1,7 +1,7 @@
 """The paper's Table 1 at point level: matching success with missing and with spurious lights, section 4.1 conditions.
 
-A frame counts when all seven front lights are in view; it is right when every true detection carries its own name and no
-spurious one carries any.
+A frame counts when all seven front lights are in view; it is right when every true detection carries its own name and
+no spurious one carries any.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ CONDITIONS = (*PAPER, (1, 1))
 
 @dataclass(slots=True)
 class Counts:
-    """Frames, and how many were right by the swarm alone, let pass wrongly by the filter, right and wrong in the end."""
+    """Frames; those right by the swarm alone, let pass wrongly by the filter, and right and wrong in the end."""
 
     frames: int = 0
     swarm_right: int = 0

@@ -96,6 +96,23 @@ def test_search_is_bounded(rng):
     assert btekf.correct(predicted, CAMERA, P_DOCK, uv, BtekfConfig(max_nodes=5)) is None
 
 
+def test_without_the_missing_branch_one_dark_light_with_a_stray_in_its_gate_voids_the_frame(rng):
+    T_dock_cam, predicted = moving(rng, 9.0)
+    uv = project_lights(CAMERA, T_dock_cam, P_DOCK)
+    uv[6] += [9.0, -9.0]
+    _, light = btekf.correct(predicted, CAMERA, P_DOCK, uv, CONFIG)
+    assert light.tolist() == [0, 1, 2, 3, 4, 5, -1]
+    assert btekf.correct(predicted, CAMERA, P_DOCK, uv, BtekfConfig(missing_branch=False)) is None
+
+
+def test_without_its_own_noise_in_the_gate_a_certain_track_refuses_every_light():
+    T = pose(0.0, 0.0, 9.0)
+    certain = btekf.Track(0, T, np.zeros(6), 1e-12 * np.eye(12))
+    uv = project_lights(CAMERA, T, P_DOCK) + [0.7, -0.5]
+    assert btekf.correct(certain, CAMERA, P_DOCK, uv, CONFIG)[1].tolist() == list(range(7))
+    assert btekf.correct(certain, CAMERA, P_DOCK, uv, BtekfConfig(noise_in_gate=False)) is None
+
+
 def test_associate_is_one_to_one_nearest_first():
     projected = np.array([[0.0, 0.0], [3.0, 0.0], [np.nan, np.nan]])
     uv = np.array([[1.0, 0.0], [0.5, 0.0], [50.0, 0.0]])

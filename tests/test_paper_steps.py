@@ -45,6 +45,15 @@ def test_swarm_leaves_strays_without_a_name(rng, strays):
     assert register(view, FRONT, None, PsoConfig(), rng).light.tolist() == [*range(7), *[-1] * strays]
 
 
+def test_residual_over_all_pairs_as_printed_has_no_minimum_at_the_alignment(rng):
+    wrong = 0
+    for _ in range(10):
+        order = rng.permutation(7)[:5]
+        view = similarity(FRONT[order], rng.uniform(-0.15, 0.15), 100.0, np.zeros(2))
+        wrong += register(view, FRONT, None, PsoConfig(residual="all_pairs"), rng).light.tolist() != order.tolist()
+    assert wrong >= 5
+
+
 def test_swarm_is_repeatable_and_its_fitness_is_the_residual():
     view = similarity(FRONT, 0.1, 80.0, np.zeros(2))
     first, second = (register(view, FRONT, None, PsoConfig(), np.random.default_rng(5)) for _ in range(2))

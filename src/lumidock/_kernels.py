@@ -98,13 +98,17 @@ def _fitness(
     w1: float,
     w2: float,
     penalty: float,
+    all_pairs: bool,
 ) -> float:
     cost = registration_cost(x, seen, lights, previous, w1, w2)
-    column = assign(cost)
     total = 0.0
-    for i in range(len(column)):
-        if column[i] >= 0:
-            total += cost[i, column[i]]
+    if all_pairs:
+        total = cost.sum()  # Eq. (2) as printed
+    else:
+        column = assign(cost)
+        for i in range(len(column)):
+            if column[i] >= 0:
+                total += cost[i, column[i]]
     turned_deg = abs(x[0] - theta_previous) * 180.0 / np.pi  # NaN without a previous frame: no penalty
     if turned_deg >= 10.0:  # Eq. (7)
         total += penalty * (1.0 + (turned_deg - 10.0) / 5.0)
@@ -138,6 +142,7 @@ def swarm(
     coefficients: Array,
     k: float,
     size: tuple[int, int, int],
+    all_pairs: bool,
     rng: np.random.Generator,
 ) -> tuple[Array, float]:
     """Best transform [theta, s, tx, ty] (4,) and its fitness, found by the enhanced particle swarm.
@@ -162,7 +167,7 @@ def swarm(
         c1 = coefficients[1] + (coefficients[0] - coefficients[1]) * falling  # Eq. (5), falling as the text says
         c2 = coefficients[3] + (coefficients[2] - coefficients[3]) * falling  # Eq. (6)
         for i in range(particles):
-            value = _fitness(at[i], seen, lights, previous, theta_previous, w1, w2, penalty)
+            value = _fitness(at[i], seen, lights, previous, theta_previous, w1, w2, penalty, all_pairs)
             idle[i] += 1
             if value < best[i] * 0.999:
                 idle[i] = 0

@@ -66,6 +66,8 @@ class PsoConfig(Section):
         12.0,
     )  # the paper's (0.5, 8) and (-1, 1) bear a stray light at the picture's edge
     shift: tuple[float, float] = (-2.0, 2.0)  # from 18.64 m on; from 30 m it takes more
+    residual: Literal["one_to_one", "all_pairs"] = "one_to_one"  # eq. (2) prints the sum over all pairs, which has no
+    # minimum at the alignment
     w1: PositiveFloat = 1.0  # eq. (8), this frame's residual
     w2: Annotated[float, Field(ge=0.0)] = 0.3  # eq. (8), distance from the previous frame
     penalty: Annotated[float, Field(ge=0.0)] = 0.5  # eq. (7)
@@ -83,6 +85,8 @@ class ConsistencyConfig(Section):
 class BtekfConfig(Section):
     """Backtracking EKF, paper section 3.2.3."""
 
+    noise_in_gate: bool = True  # eq. (11), (12) print the gate without measurement noise
+    missing_branch: bool = True  # section 3.2.3 d prints none: every gated light must find its spot
     gate: PositiveFloat = 13.8  # M^2 of eq. (12): chi-square, 2 dof, 99.9 %
     pixel_sigma: PositiveFloat = 1.0  # px, R of eq. (13)
     accept_px: PositiveFloat = 4.0  # reprojection residual after an update

@@ -64,11 +64,12 @@ def update(track: Track, camera: Camera, p_dock: Array, uv: Array, config: Btekf
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Gate:
-    """A light under a track: predicted pixel `v` (2,), Jacobian (2, 12) and innovation covariance (2, 2)."""
+    """A light under a track: predicted pixel `v` (2,), Jacobian (2, 12), innovation covariance (2, 2) and the gate's."""
 
     v: Array
     J: Array
     S: Array
+    S_gate: Array
 
     @classmethod
     def of(cls, track: Track, camera: Camera, p: Array, config: BtekfConfig) -> _Gate | None:
@@ -77,13 +78,14 @@ class _Gate:
         if not np.isfinite(uv).all():
             return None
         J = np.concatenate([J_uv_pose[0], np.zeros((2, 6))], axis=1)
-        S = J @ track.cov @ J.T + config.pixel_sigma**2 * np.eye(2)  # Eq. (11), with the measurement's own noise
-        return cls(uv[0], J, S)
+        projected = J @ track.cov @ J.T  # Eq. (11)
+        S = projected + config.pixel_sigma**2 * np.eye(2)
+        return cls(uv[0], J, S, S if config.noise_in_gate else projected)
 
     def distance2(self, uv: Array) -> Array:
         """Squared Mahalanobis distance (N,) of pixels `uv` (N, 2): eq. (12)."""
         error = uv - self.v
-        return np.asarray(np.einsum("ni,ni->n", error, np.linalg.solve(self.S, error.T).T))
+        return np.asarray(np.einsum("ni,ni->n", error, np.linalg.solve(self.S_gate, error.T).T))
 
     def update(self, track: Track, pixel: Array) -> Track:
         """The track after this light was seen at `pixel` (2,): eq. (13)."""
@@ -104,7 +106,8 @@ def correct(
     """
     order = _gated_lights(predicted, camera, p_dock, uv, config)
     search = _Search(camera, p_dock, uv, config)
-    for missing in range(len(order) - config.min_lights + 1):
+    most_missing = len(order) - config.min_lights if config.missing_branch else min(len(order) - config.min_lights, 0)
+    for missing in range(most_missing + 1):
         track = search.run(predicted, order, frozenset(), missing)
         if track is not None:
             return _accept(track, camera, p_dock, uv, config)

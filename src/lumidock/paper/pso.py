@@ -54,6 +54,7 @@ def register(
         np.array([*config.c1, *config.c2]),
         config.k,
         (config.particles, config.iterations, config.stagnation),
+        config.residual == "all_pairs",
         rng,
     )
     cost = _kernels.registration_cost(transform, seen, lights, placed, config.w1, config.w2)
