@@ -108,7 +108,7 @@ def test_without_the_missing_branch_one_dark_light_with_a_stray_in_its_gate_void
 def test_without_its_own_noise_in_the_gate_a_certain_track_refuses_every_light():
     T = pose(0.0, 0.0, 9.0)
     certain = btekf.Track(0, T, np.zeros(6), 1e-12 * np.eye(12))
-    uv = project_lights(CAMERA, T, P_DOCK) + [0.7, -0.5]
+    uv = project_lights(CAMERA, T, P_DOCK) + np.array([0.7, -0.5])
     assert btekf.correct(certain, CAMERA, P_DOCK, uv, CONFIG)[1].tolist() == list(range(7))
     assert btekf.correct(certain, CAMERA, P_DOCK, uv, BtekfConfig(noise_in_gate=False)) is None
 

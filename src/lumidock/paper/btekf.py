@@ -64,7 +64,7 @@ def update(track: Track, camera: Camera, p_dock: Array, uv: Array, config: Btekf
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Gate:
-    """A light under a track: predicted pixel `v` (2,), Jacobian (2, 12), innovation covariance (2, 2) and the gate's."""
+    """A light under a track: predicted pixel `v` (2,), Jacobian (2, 12), covariances (2, 2) of innovation and gate."""
 
     v: Array
     J: Array
