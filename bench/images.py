@@ -66,11 +66,11 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def rear_reach_m(gray: Literal["max", "luma"], seed: int) -> float:
-    """Farthest z of the approach from which on, down to 9 m, all six rear lights are found in every third frame."""
+    """Farthest z of the approach from which on, down to 4 m, all six rear lights are found in every third frame."""
     scenario, station, camera = load_scenario("approach"), shipped_station(), shipped_camera()
     _, poses = trajectory(scenario, np.random.default_rng([seed, 0]))
-    rear, reach = station.lights_of("rear"), 9.0
-    for number in [n for n in range(0, len(poses), 3) if 9.0 <= poses[n, 2, 3] < 17.0][::-1]:
+    rear, reach = station.lights_of("rear"), 4.0
+    for number in [n for n in range(0, len(poses), 3) if 4.0 <= poses[n, 2, 3] < 17.0][::-1]:
         rng = np.random.default_rng([seed, number])
         nothing = np.empty(0, np.int64)
         image, seen, _ = render_frame(scenario, station, camera, poses[number], np.empty((0, 2)), nothing, rng)
