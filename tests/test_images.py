@@ -158,10 +158,11 @@ def test_what_is_no_file_is_a_bad_frame(tmp_path, make, why):
 
 
 @pytest.mark.parametrize("content", [PNG, JPEG], ids=["png", "jpeg"])
-def test_no_part_of_a_file_is_a_picture(read, content):
+@pytest.mark.parametrize("padding", [0, 1], ids=["cut", "zeros"])
+def test_no_part_of_a_file_is_a_picture(read, content, padding):
     for length in range(len(content)):
         with pytest.raises(FrameError):
-            read(content[:length])
+            read(content[:length] + padding * bytes(len(content) - length))
 
 
 def test_no_flipped_bit_of_a_png_goes_unseen(read):

@@ -69,7 +69,7 @@ def test_registration_cost_agrees_with_complex_numbers(rng):
 
 def fly(seen, rng, *, previous=NEW, theta_previous=np.nan, size=(80, 120, 12)):
     weights, coefficients = np.array([1.0, 0.3, 0.5]), np.array([2.5, 0.5, 1.5, 0.5])
-    return swarm(seen, LIGHTS, previous, theta_previous, LOW, HIGH, weights, 0.7, coefficients, 0.8, size, rng)
+    return swarm(seen, LIGHTS, previous, theta_previous, LOW, HIGH, weights, 0.7, coefficients, 0.8, size, False, rng)
 
 
 def moved(points, theta, s, tx, ty):

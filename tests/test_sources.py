@@ -207,13 +207,20 @@ def test_a_frame_rate_overrides_a_videos_stamps(tmp_path):
     assert [told(item)[1] for item in open_source(tmp_path / "a.avi", fps=3.0).items()][:3] == [0, 333333333, 666666667]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5])
-def test_a_broken_video_is_refused(tmp_path, share):
-    write_video(tmp_path / "a.mp4")
-    content = (tmp_path / "a.mp4").read_bytes()
-    (tmp_path / "a.mp4").write_bytes(content[: int(share * len(content))])
-    with refused(tmp_path / "a.mp4", "not a video"):
-        open_source(tmp_path / "a.mp4")
+@pytest.mark.parametrize(
+    ("name", "cut"),
+    [
+        ("a.mp4", lambda _: b""),
+        ("a.mp4", lambda content: content[: len(content) // 2]),
+        ("a.avi", lambda content: content[: content.index(b"movi") + 4]),
+    ],
+    ids=["empty", "half", "no frames"],
+)
+def test_a_broken_video_is_refused(tmp_path, name, cut):
+    write_video(tmp_path / name)
+    (tmp_path / name).write_bytes(cut((tmp_path / name).read_bytes()))
+    with refused(tmp_path / name, "not a video"):
+        open_source(tmp_path / name)
 
 
 @pytest.mark.parametrize(

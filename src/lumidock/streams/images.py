@@ -24,8 +24,8 @@ _END = b"\xff\xd9"
 def read_image(path: Path) -> Image:
     """Read a PNG or JPEG as (H, W) mono8 or, where it has colour, (H, W, 3) bgr8.
 
-    The header is read before any pixel, and the file must be complete: the decoder returns whole pictures from half
-    files. Raises: FrameError `bad_frame`, one line.
+    The header is read before any pixel, and the file must be complete: with zeros in place of its second half, as a
+    power cut leaves it, the decoder takes it for whole. Raises: FrameError `bad_frame`, one line.
     """
     try:
         status = path.stat()
