@@ -33,6 +33,7 @@ class ExtractConfig(Section):
     min_roundness: Fraction = 0.60  # 4 pi area / perimeter^2
     min_compactness: Fraction = 0.55  # area / area of the fitted circle, or its inverse
     max_arc_error: Fraction = 0.06  # rms distance from the circle, of its radius, where the picture's edge cuts a light
+    max_thresholds: PositiveInt = 6  # tried in one frame; clean frames need one to three
     max_regions: PositiveInt = (
         80  # more mean that the threshold is still inside the noise; at last the largest are kept
     )

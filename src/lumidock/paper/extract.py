@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -52,7 +53,7 @@ def lights(frame: Frame, config: ExtractConfig) -> Detections:
     background, threshold, binary, outlines = _separated(gray, config)
     regions = _connected_regions(gray, binary, outlines)
     spots = [spot for region in regions for spot in _spots(region, threshold, background, config)]
-    spots = [spot for spot in spots if _stands_out(spot, gray, config)]
+    spots = sorted((s for s in spots if _stands_out(s, gray, config)), key=lambda s: -s.flux)[: config.max_regions]
     columns = np.array([[s.u, s.v, s.radius, s.flux] for s in spots]).reshape(-1, 4)
     unknown = np.full(len(spots), np.nan)
     uv, radius_px, flux = columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy()
@@ -61,7 +62,7 @@ def lights(frame: Frame, config: ExtractConfig) -> Detections:
 
 def _separated(gray: Image, config: ExtractConfig) -> tuple[int, int, Image, list[Array]]:
     """Background, threshold, binarised frame and outlines at the lowest threshold that leaves few enough regions."""
-    for background, threshold in separating_thresholds(gray, config):  # noqa: B007
+    for background, threshold in islice(separating_thresholds(gray, config), config.max_thresholds):  # noqa: B007
         binary, outlines = _outlines(gray, threshold)
         if len(outlines) <= config.max_regions:
             break
