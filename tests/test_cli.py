@@ -20,6 +20,7 @@ from lumidock.camera import save_camera
 from lumidock.sim.scenario import shipped_scenarios
 
 LUMIDOCK = str(Path(sys.executable).with_name("lumidock"))
+PLAIN = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
 COMMANDS = ("run", "sim", "eval", "demo")
 SET = [word for setting in SETTINGS for word in ("--set", setting)]
 
@@ -80,7 +81,7 @@ def fixes(folder):
 def start(*words, **options):
     """The command line in a process of its own, with a process group of its own."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
-    return subprocess.Popen([LUMIDOCK, *map(str, words)], **(pipes | options))
+    return subprocess.Popen([LUMIDOCK, *words], **(pipes | {"env": PLAIN} | options))
 
 
 def wait_for(condition, seconds=120.0):
@@ -366,7 +367,8 @@ def test_a_links_target_is_not_overwritten(lumidock, bare, earlier, tmp_path):
 
 
 def test_any_folder_name_can_be_told(bare, tmp_path):
-    process = start("run", bare, "--out", os.fsencode(tmp_path) + b"/\xff", text=False)
+    strict = PLAIN | {"PYTHONIOENCODING": "utf-8:strict"}
+    process = start("run", bare, "--out", os.fsencode(tmp_path) + b"/\xff", text=False, env=strict)
     out, err = process.communicate(timeout=30)
     assert (process.returncode, err) == (0, b"")
     assert b"7 frames" in out

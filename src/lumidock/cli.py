@@ -128,7 +128,7 @@ def _run(
     from lumidock.streams.runfolder import RunFolder
 
     if method != "paper":
-        raise InputError(f"--method {method}: there is paper")
+        raise InputError(f"--method {method}: no such method; there is paper")
     opened = open_source(source, fps)
     station_file = _file("station", station, opened.station, opened)
     camera_file = _file("camera", camera, opened.camera, opened)
