@@ -64,7 +64,22 @@ def test_shipped_scenarios_load_and_say_what_they_are(name):
 
 
 @pytest.mark.parametrize(
-    "setting", ["path.speed", "nothing=1", "path.speed_m_s=-1", "path.speed_m_s=.nan", "name.x=1", "path=[", "=3"]
+    "setting",
+    [
+        "path.frame_interval_s=1e-300",
+        "path.speed_m_s=1e-9",
+        "path.start_z_m=1e308",
+        "path.sway_period_s=[9, 3]",
+        "path.taper_z_m=[2, 2]",
+        "faults.spurious=100000",
+        "path.speed",
+        "nothing=1",
+        "path.speed_m_s=-1",
+        "path.speed_m_s=.nan",
+        "name.x=1",
+        "path=[",
+        "=3",
+    ],
 )
 def test_bad_settings_are_refused_in_one_line(setting):
     with pytest.raises(InputError) as caught:

@@ -68,9 +68,10 @@ def main() -> None:
     except LumidockError as error:
         _fail(str(error))
     except BrokenPipeError:  # whoever read our output has left
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         sys.exit(1)
     except OSError as error:
+        _drop_output()
         _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
     sys.exit(code or 0)
 
@@ -82,6 +83,14 @@ def _keep_streams_clean() -> None:
             stream.reconfigure(errors="backslashreplace")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
+def _drop_output() -> None:
+    """Give up what cannot be written, or the interpreter would complain of it at its end."""
+    try:
+        print(end="", flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(text: str) -> NoReturn:

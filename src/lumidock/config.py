@@ -5,11 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt
 
 from lumidock.yamlfile import read_mapping, validate
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Effort = Annotated[int, Field(ge=1, le=10_000)]
+
+
+def _rising(bounds: tuple[float, float]) -> tuple[float, float]:
+    if bounds[0] >= bounds[1]:
+        raise ValueError("wanted the lower bound first")
+    return bounds
+
+
+Bounds = Annotated[tuple[float, float], AfterValidator(_rising)]
 
 
 class Section(BaseModel):
@@ -55,25 +65,25 @@ class LayersConfig(Section):
 class PsoConfig(Section):
     """Enhanced particle swarm, paper section 3.2.1."""
 
-    particles: PositiveInt = 80
-    iterations: PositiveInt = 120
+    particles: Effort = 80
+    iterations: Effort = 120
     inertia: PositiveFloat = 0.7  # w of eq. (3)
     c1: tuple[float, float] = (2.5, 0.5)  # base and final, eq. (5)
     c2: tuple[float, float] = (1.5, 0.5)  # base and final, eq. (6)
     k: PositiveFloat = 0.8  # eq. (4)
-    theta_deg: tuple[float, float] = (-10.0, 10.0)
-    scale: tuple[float, float] = (
+    theta_deg: Bounds = (-10.0, 10.0)
+    scale: Bounds = (
         0.5,
         12.0,
     )  # the paper's (0.5, 8) and (-1, 1) bear a stray light at the picture's edge
-    shift: tuple[float, float] = (-2.0, 2.0)  # from 18.64 m on; from 30 m it takes more
+    shift: Bounds = (-2.0, 2.0)  # from 18.64 m on; from 30 m it takes more
     residual: Literal["one_to_one", "all_pairs"] = "one_to_one"  # eq. (2) prints the sum over all pairs, which has no
     # minimum at the alignment
     w1: PositiveFloat = 1.0  # eq. (8), this frame's residual
     w2: Annotated[float, Field(ge=0.0)] = 0.3  # eq. (8), distance from the previous frame
     penalty: Annotated[float, Field(ge=0.0)] = 0.5  # eq. (7)
     stagnation: PositiveInt = 12  # iterations without gain before a particle starts anew
-    seed: int = 0
+    seed: NonNegativeInt = 0
 
 
 class ConsistencyConfig(Section):

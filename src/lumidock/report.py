@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -11,6 +12,9 @@ import numpy as np
 from lumidock.datatypes import Array, Fix, Image
 from lumidock.errors import LumidockError
 from lumidock.station import Station
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _STAGE_COLORS = {"search": "#7f7f7f", "front": "#d9860a", "transition": "#2a9d5c", "rear": "#2f6fd0"}
 
@@ -29,14 +33,17 @@ def plot_trajectory(fixes: Sequence[Fix], truth: dict[str, Array], station: Stat
     FigureCanvasAgg(figure)
     top, side, error = figure.subplots(3, 1, sharex=True, height_ratios=[1, 1, 1.1])
     true = np.array([T[:3, 3] for T in truth.values()])
+    valid = [fix for fix in fixes if fix.T_dock_cam is not None]
+    at = np.array([fix.T_dock_cam[:3, 3] for fix in valid if fix.T_dock_cam is not None]).reshape(-1, 3)
     for axes, column, label in ((top, 0, "x, m (right)"), (side, 1, "y, m (up)")):
         axes.plot(true[:, 2], true[:, column], color="black", linewidth=1, label="truth")
         axes.scatter(station.p_dock[:, 2], station.p_dock[:, column], marker="*", s=40, color="#c9a400", label="lights")
-        _scatter_by_stage(axes, fixes, lambda fix, c=column: fix.T_dock_cam[c, 3])
+        _scatter_by_stage(axes, valid, at[:, 2], at[:, column])
         reach = 1.3 * max(1.0, float(np.abs(true[:, column]).max()))
         axes.set_ylim(-reach, reach)
         axes.set_ylabel(label)
-    _scatter_by_stage(error, fixes, lambda fix: float(np.linalg.norm((fix.T_dock_cam - truth[fix.frame])[:3, 3])))
+    missed = at - np.array([truth[fix.frame][:3, 3] for fix in valid]).reshape(-1, 3)
+    _scatter_by_stage(error, valid, at[:, 2], np.maximum(np.linalg.norm(missed, axis=1), 1e-6))
     error.set_yscale("log")
     error.set_ylabel("position error, m")
     error.set_xlabel("z, m: distance before the entrance plane; the cage is 0 to -5 m")
@@ -49,14 +56,12 @@ def plot_trajectory(fixes: Sequence[Fix], truth: dict[str, Array], station: Stat
     figure.savefig(out, dpi=110)
 
 
-def _scatter_by_stage(axes, fixes: Sequence[Fix], value) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001
-    """Points over z, coloured by docking stage."""
-    valid = [fix for fix in fixes if fix.T_dock_cam is not None]
+def _scatter_by_stage(axes: Axes, fixes: Sequence[Fix], z: Array, values: Array) -> None:
+    """Points over z, coloured by the docking stage of each of the N `fixes`; `z` (N,), `values` (N,)."""
     for stage, color in _STAGE_COLORS.items():
-        inside = [fix for fix in valid if fix.stage == stage]
-        if inside:
-            z = [fix.T_dock_cam[2, 3] for fix in inside if fix.T_dock_cam is not None]
-            axes.scatter(z, [value(fix) for fix in inside], s=9, color=color, label=f"{stage} stage")
+        inside = np.array([fix.stage == stage for fix in fixes], bool)
+        if inside.any():
+            axes.scatter(z[inside], values[inside], s=9, color=color, label=f"{stage} stage")
 
 
 def contact_sheet(pictures: Sequence[Image], out: Path, *, columns: int = 2, width: int = 720) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from lumidock.datatypes import Array
 from lumidock.errors import InputError
@@ -16,6 +16,9 @@ from lumidock.geometry import so3_exp
 from lumidock.yamlfile import read_mapping, validate
 
 R_DOCK_CAM_HEAD_ON = np.diag([1.0, -1.0, -1.0])
+_MAX_FRAMES = 100_000
+Distance = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+Count = Annotated[int, Field(ge=0, le=1000)]
 Triple = tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
@@ -28,18 +31,36 @@ class Path3D(_Section):
     """The camera's path. `approach` runs along the dock's axis; `rectangle` goes once round at a constant z."""
 
     kind: Literal["approach", "rectangle"] = "approach"
-    start_z_m: float = 30.0
-    end_z_m: float = -3.0
+    start_z_m: Distance = 30.0
+    end_z_m: Distance = -3.0
     speed_m_s: PositiveFloat = 1.0
     frame_interval_s: PositiveFloat = 0.15
-    half_width_m: PositiveFloat = 9.0  # of the rectangle
-    half_height_m: PositiveFloat = 7.5
+    half_width_m: Annotated[float, Field(gt=0, le=1000)] = 9.0  # of the rectangle
+    half_height_m: Annotated[float, Field(gt=0, le=1000)] = 7.5
     sway_m: Triple = (0.7, 0.7, 0.0)  # largest excursion in x, y, z
     sway_deg: Triple = (2.1, 2.1, 3.0)  # largest pitch, yaw, roll
     near_sway_m: Triple = (0.035, 0.035, 0.0)  # the same, at and below taper_z_m[1]
     near_sway_deg: Triple = (0.35, 0.35, 0.5)
     taper_z_m: tuple[float, float] = (15.0, 2.0)  # the sway shrinks between these
     sway_period_s: tuple[PositiveFloat, PositiveFloat] = (7.0, 20.0)
+
+    @model_validator(mode="after")
+    def _path_can_be_walked(self) -> Self:
+        length = (
+            abs(self.start_z_m - self.end_z_m)
+            if self.kind == "approach"
+            else 4.0 * (self.half_width_m + self.half_height_m)
+        )
+        step = self.speed_m_s * self.frame_interval_s
+        if not 0.0 < step < 1e6 or length / step > _MAX_FRAMES:
+            raise ValueError(f"speed_m_s times frame_interval_s gives no path of at most {_MAX_FRAMES} frames")
+        if self.frame_interval_s < 1e-6 or length / self.speed_m_s > 1e9:
+            raise ValueError("stamps of this path do not fit into nanoseconds")
+        if self.taper_z_m[0] <= self.taper_z_m[1]:
+            raise ValueError("taper_z_m: wanted the farther distance first")
+        if self.sway_period_s[0] > self.sway_period_s[1]:
+            raise ValueError("sway_period_s: wanted the shorter period first")
+        return self
 
 
 class Water(_Section):
@@ -66,8 +87,8 @@ class Sensor(_Section):
 class Faults(_Section):
     """What goes wrong with the lights."""
 
-    missing: NonNegativeInt = 0  # front lights dark in each frame, drawn anew
-    spurious: NonNegativeInt = 0  # lights that wander over the whole picture
+    missing: Count = 0  # front lights dark in each frame, drawn anew
+    spurious: Count = 0  # lights that wander over the whole picture
 
 
 class Spots(_Section):

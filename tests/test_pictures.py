@@ -1,0 +1,70 @@
+"""Overlays, the trajectory plot and the contact sheet: they are made, and show what they should."""
+
+import cv2
+import numpy as np
+from bench.shipped import shipped_camera, shipped_station
+
+from lumidock.datatypes import Detections, Fix, Match
+from lumidock.overlay import around_lights, draw, whole
+from lumidock.pose import project_lights
+from lumidock.report import contact_sheet, plot_trajectory
+
+STATION, CAMERA = shipped_station(), shipped_camera()
+
+
+def fix_at(z, *, valid=True):
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[2, 3] = z
+    spots = Detections.from_uv(
+        f"{z}", 0, np.concatenate([project_lights(CAMERA, T, STATION.p_dock[:7]), [[90.0, 80.0]]])
+    )
+    match = Match(spots, np.array([*range(7), -1]))
+    if not valid:
+        return Fix(f"{z}", 0, "none", "search", 8, reason="inconsistent", match=match)
+    return Fix(f"{z}", 0, "acquired", "front", 8, 7, T, match=match)
+
+
+def test_overlay_marks_every_detection_where_it_is():
+    image = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+    fix = fix_at(9.0)
+    view = whole(image, 1224)
+    drawn = draw(image, fix, STATION, CAMERA, view)
+    assert drawn.shape == (1024, 1224, 3)
+    for uv in fix.match.detections.uv:
+        u, v = view.at(uv)
+        assert drawn[v - 12 : v + 13, u - 12 : u + 13].max() > 100
+    assert image.max() == 0
+
+
+def test_overlay_of_a_mono_frame_without_a_fix_has_no_crosses():
+    image = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    with_pose, without = (
+        draw(image, fix_at(9.0, valid=valid), STATION, CAMERA, whole(image, 1224)) for valid in (True, False)
+    )
+    u, v = whole(image, 1224).at(fix_at(9.0).match.detections.uv[0])
+    assert with_pose[v, u].max() > 0
+    assert without[v, u].max() == 0
+
+
+def test_close_view_holds_all_detections_and_stays_inside():
+    image = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+    for z in (25.0, 9.0, 3.0):
+        view = around_lights(image, fix_at(z), 600)
+        assert 0 <= view.u <= view.u + view.width <= CAMERA.width
+        assert 0 <= view.v <= view.v + view.height <= CAMERA.height
+        for uv in fix_at(z).match.detections.uv[:7]:
+            assert view.u <= uv[0] <= view.u + view.width
+
+
+def test_plot_and_sheet_are_written(tmp_path):
+    fixes = [fix_at(z) for z in (20.0, 9.0)] + [fix_at(5.0, valid=False)]
+    plot_trajectory(
+        fixes, {fix.frame: fix_at(float(fix.frame)).T_dock_cam for fix in fixes}, STATION, tmp_path / "t.png"
+    )
+    assert cv2.imread(str(tmp_path / "t.png")).std() > 10
+    contact_sheet(
+        [np.full((100, 120, 3), level, np.uint8) for level in (0, 80, 160, 240)], tmp_path / "s.jpg", width=60
+    )
+    assert cv2.imread(str(tmp_path / "s.jpg")).shape == (108, 128, 3)
+    contact_sheet([], tmp_path / "none.jpg")
+    assert not (tmp_path / "none.jpg").exists()
