@@ -26,7 +26,7 @@ STATION = {
     "name": "small",
     "lights": [{"id": name, "layer": "front", "position": [x, y, 0]} for name, (x, y) in LIGHTS.items()],
 }
-SETTINGS = ("path.start_z_m=4.0", "path.end_z_m=2.5", "path.frame_interval_s=0.25", "path.near_sway_m=[0,0,0]")
+SETTINGS = ("path.start_z_m=4.0", "path.end_z_m=2.5", "path.frame_interval_s=0.25", "sensor.exposure_ms=0.05")
 LOST = ("bad_frame", "bad_stamp")
 
 

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeIn
 from lumidock.yamlfile import read_mapping, validate
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Hue = Annotated[int, Field(ge=0, le=179)]
 Effort = Annotated[int, Field(ge=1, le=10_000)]
 
 
@@ -53,7 +54,7 @@ class LayersConfig(Section):
     """Layer discrimination, paper section 3.1.2."""
 
     method: Literal["auto", "color", "radius"] = "auto"  # auto: colour where the frame has any
-    blue_hue: tuple[int, int] = (98, 132)  # OpenCV hue, 0-179
+    blue_hue: tuple[Hue, Hue] = (98, 132)  # OpenCV hue, 0-179
     min_saturation: int = 60  # of 255; a saturated white core has none
     min_value: int = 25  # of 255
     min_blue: Fraction = 0.5  # share of the ring around the core that must be blue
@@ -101,7 +102,8 @@ class BtekfConfig(Section):
     gate: PositiveFloat = 13.8  # M^2 of eq. (12): chi-square, 2 dof, 99.9 %
     pixel_sigma: PositiveFloat = 1.0  # px, R of eq. (13)
     accept_px: PositiveFloat = 4.0  # reprojection residual after an update
-    min_lights: PositiveInt = 3  # section 3.2.3 e
+    min_lights: Annotated[int, Field(ge=3)] = 3  # section 3.2.3 e
+    three_light_gap_s: PositiveFloat = 0.5  # three lights fit any three spots: only so long after a fix of four or more
     accel_m_s2: PositiveFloat = 0.5  # white noise on the velocity, per axis
     accel_rad_s2: PositiveFloat = 0.15
     start_speed_m_s: PositiveFloat = 1.0  # 1 sigma of the unknown velocity at the first fix
@@ -123,6 +125,8 @@ class PaperConfig(Section):
     layers: LayersConfig = LayersConfig()
     pso: PsoConfig = PsoConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
+    max_spots: PositiveInt = 200  # a frame with more is refused: `too_many`
+    max_lights: PositiveInt = 40  # of a layer; the ratio filter looks at all triples
     btekf: BtekfConfig = BtekfConfig()
     pose: PoseConfig = PoseConfig()
 

@@ -62,6 +62,8 @@ class Detections:
 
     def __post_init__(self) -> None:
         require_shape("uv", self.uv, None, 2)
+        if not np.isfinite(self.uv).all():
+            raise ValueError("uv is not finite")
         for name in ("radius_px", "flux", "p_light", "p_rear"):
             require_shape(name, getattr(self, name), len(self.uv))
 

@@ -46,7 +46,7 @@ def plot_trajectory(fixes: Sequence[Fix], truth: dict[str, Array], station: Stat
     _scatter_by_stage(error, valid, at[:, 2], np.maximum(np.linalg.norm(missed, axis=1), 1e-6))
     error.set_yscale("log")
     error.set_ylabel("position error, m")
-    error.set_xlabel("z, m: distance before the entrance plane; the cage is 0 to -5 m")
+    error.set_xlabel("z, m: distance before the entrance plane; shaded: inside the dock")
     error.set_xlim(float(true[:, 2].max()) + 1.0, float(station.p_dock[:, 2].min()) - 1.0)
     top.set_title("Camera in the dock frame: from above, from the side, and how far from the truth", loc="left")
     top.legend(loc="upper right", ncols=3, fontsize=8)

@@ -106,8 +106,8 @@ def correct(
     """
     order = _gated_lights(predicted, camera, p_dock, uv, config)
     search = _Search(camera, p_dock, uv, config)
-    most_missing = len(order) - config.min_lights if config.missing_branch else min(len(order) - config.min_lights, 0)
-    for missing in range(most_missing + 1):
+    spare = len(order) - config.min_lights
+    for missing in range(spare + 1 if config.missing_branch else min(spare + 1, 1)):
         track = search.run(predicted, order, frozenset(), missing)
         if track is not None:
             return _accept(track, camera, p_dock, uv, config)

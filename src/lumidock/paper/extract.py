@@ -17,6 +17,8 @@ import numpy as np
 from lumidock.config import ExtractConfig
 from lumidock.datatypes import Array, Detections, Frame, Image, Indices
 
+_FRAME_PX = 2
+
 
 @dataclass(frozen=True, slots=True)
 class _Spot:
@@ -123,9 +125,12 @@ def otsu(histogram: Array | Indices, low: int) -> int:
 def _outlines(gray: Image, threshold: int) -> tuple[Image, list[Array]]:
     """The binarised frame and the outlines of its Canny edges."""
     _, binary = cv2.threshold(gray, threshold, 255, cv2.THRESH_BINARY)
-    edges = cv2.dilate(cv2.Canny(binary, 100, 200), np.ones((3, 3), np.uint8))  # closes the gaps Canny leaves
-    contours, _ = cv2.findContours(edges, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    return np.asarray(binary, np.uint8), [np.asarray(contour) for contour in contours]
+    # a dark frame around the picture closes the outlines of lights that its edge cuts; dilation, the gaps Canny leaves
+    framed = cv2.copyMakeBorder(binary, _FRAME_PX, _FRAME_PX, _FRAME_PX, _FRAME_PX, cv2.BORDER_CONSTANT, value=0)
+    edges = cv2.dilate(cv2.Canny(framed, 100, 200), np.ones((3, 3), np.uint8))
+    contours, _ = cv2.findContours(edges, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE, offset=(-_FRAME_PX, -_FRAME_PX))
+    last = np.array(gray.shape[::-1]) - 1
+    return np.asarray(binary, np.uint8), [np.clip(contour, 0, last) for contour in contours]
 
 
 def _connected_regions(gray: Image, binary: Image, outlines: list[Array]) -> Iterator[_Region]:

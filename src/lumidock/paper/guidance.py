@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lumidock.datatypes import LayerPose, Stage
+from lumidock.paper.layer import MIN_FOR_SWARM
 
 
 class Guidance:
@@ -18,11 +19,17 @@ class Guidance:
         self.stage: Stage = "search"
 
     def choose(self, poses: dict[str, LayerPose]) -> LayerPose | None:
-        """The pose that guides in this frame: the rear layer's from the frame on that shows all of its lights."""
+        """The pose that guides in this frame: the rear layer's from the frame on that shows all of its lights.
+
+        A pose of three lights, carried by history, gives way to one that stands on its own.
+        """
         front, rear = poses.get(self._front), poses.get(self._rear)
         self.stage = self._next_stage(front, rear)
-        self._on_rear = rear is not None and (self._on_rear or rear.n_used == self._n_rear)
-        return rear if self._on_rear or front is None else front
+        self._on_rear |= rear is not None and rear.n_used == self._n_rear
+        if front is None or rear is None:
+            return rear or front
+        carried = rear.n_used < MIN_FOR_SWARM <= front.n_used
+        return rear if self._on_rear and not carried else front
 
     def _next_stage(self, front: LayerPose | None, rear: LayerPose | None) -> Stage:
         if front is not None and rear is not None:

@@ -21,7 +21,7 @@ MIN_FOR_SWARM = 4  # lights of a layer, section 1, contribution (2)
 class LayerAnswer:
     """The light of each spot (N,), -1 for none, as indices into the station; and a pose or the reason against one.
 
-    `status` says whether history took part in the pose.
+    `status` is `tracking` when the layer had a track, `acquired` when it was won without.
     """
 
     light: Indices
@@ -39,6 +39,7 @@ class LayerLocalizer:
         self.p_dock = station.p_dock[self.lights]
         self.registration: pso.Registration | None = None
         self.track: btekf.Track | None = None
+        self._earned_t_ns: int | None = None  # last pose of four or more lights
         self._rng = np.random.default_rng(config.pso.seed)
 
     def locate(self, t_ns: int, uv: Array) -> LayerAnswer:
@@ -55,7 +56,7 @@ class LayerLocalizer:
     def _predict(self, t_ns: int) -> btekf.Track | None:
         """The track at `t_ns`, unless it is too old or from the future."""
         if self.track is None or not 0 < t_ns - self.track.t_ns <= self.config.btekf.max_gap_s * 1e9:
-            self.track = None
+            self.track = self.registration = None
             return None
         return btekf.predict(self.track, t_ns, self.config.btekf)
 
@@ -90,7 +91,7 @@ class LayerLocalizer:
         """Section 3.3: pose of the named spots, and the track that the next frame starts from."""
         named = light >= 0
         p_dock, pixels = self.p_dock[light[named]], uv[named]
-        T_dock_cam = self._solve(p_dock, pixels, track)
+        T_dock_cam = self._solve(t_ns, p_dock, pixels, track)
         if T_dock_cam is None:
             return self._nothing(uv, "residual")
         status: Status = "acquired" if track is None else "tracking"
@@ -99,16 +100,25 @@ class LayerLocalizer:
         if track is None or not self._reprojects(track.T_dock_cam, p_dock, pixels):
             track = btekf.start(t_ns, T_dock_cam, self.camera, p_dock, self.config.btekf)
         self.track = track
+        if len(p_dock) >= MIN_FOR_SWARM:
+            self._earned_t_ns = t_ns
         pose = LayerPose(self.layer, T_dock_cam, int(named.sum()), source)
         return LayerAnswer(np.where(named, self.lights[light], -1), pose, status=status)
 
-    def _solve(self, p_dock: Array, uv: Array, track: btekf.Track | None) -> Array | None:
-        """SQPnP; with three lights, which leave it several solutions, the filter's pose."""
-        few = len(uv) < MIN_FOR_SWARM
-        T_dock_cam = (track.T_dock_cam if track else None) if few else sqpnp(self.camera, p_dock, uv)
+    def _solve(self, t_ns: int, p_dock: Array, uv: Array, track: btekf.Track | None) -> Array | None:
+        """SQPnP; with three lights, which leave it several solutions, the filter's pose, shortly after a better one."""
+        if len(uv) >= MIN_FOR_SWARM:
+            T_dock_cam = sqpnp(self.camera, p_dock, uv)
+        elif track is not None and self._earned_within(t_ns, self.config.btekf.three_light_gap_s):
+            T_dock_cam = track.T_dock_cam
+        else:
+            return None
         if T_dock_cam is None or not self._reprojects(T_dock_cam, p_dock, uv):
             return None
         return T_dock_cam
+
+    def _earned_within(self, t_ns: int, seconds: float) -> bool:
+        return self._earned_t_ns is not None and t_ns - self._earned_t_ns <= seconds * 1e9
 
     def _reprojects(self, T_dock_cam: Array, p_dock: Array, uv: Array) -> bool:
         return reprojection_rms_px(self.camera, T_dock_cam, p_dock, uv) <= self.config.pose.max_rms_px

@@ -50,7 +50,7 @@ class LayerDiscriminator:
 
     def rear(self, detections: Detections) -> np.ndarray:
         """Whether each spot (N,) belongs to the rear layer."""
-        known = np.isfinite(detections.p_rear).all()
+        known = np.isfinite(detections.p_rear).any()
         by_color = self.config.method == "color" or (self.config.method == "auto" and known)
         rear = detections.p_rear > self.config.min_blue if by_color else self._by_radius(detections.radius_px)
         return np.asarray(rear)

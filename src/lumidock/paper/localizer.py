@@ -10,9 +10,11 @@ from lumidock.datatypes import Detections, Fix, Frame, Match
 from lumidock.errors import FrameError, InputError
 from lumidock.paper import extract
 from lumidock.paper.guidance import Guidance
-from lumidock.paper.layer import LayerAnswer, LayerLocalizer
+from lumidock.paper.layer import MIN_FOR_SWARM, LayerAnswer, LayerLocalizer
 from lumidock.paper.layers import LayerDiscriminator, label_by_color
 from lumidock.station import Station
+
+_MIN_SPREAD = 0.05  # of a layer's lights across their line, as a share of along it
 
 
 class PaperLocalizer:
@@ -21,11 +23,10 @@ class PaperLocalizer:
     def __init__(
         self, station: Station, camera: Camera, config: PaperConfig | None = None, *, cold: bool = False
     ) -> None:
-        """Raises: InputError for a station of more than two layers, which the method cannot tell apart."""
-        if len(station.layers) > 2:
-            raise InputError(f"{station.name}: {len(station.layers)} layers; the paper's method knows at most two")
+        """Raises: InputError for a station that the method cannot tell apart."""
         self.station, self.camera, self.cold = station, camera, cold
         self.config = config or PaperConfig()
+        _check(station, self.config)
         self.forget()
 
     def forget(self) -> None:
@@ -47,12 +48,18 @@ class PaperLocalizer:
         return self.process_detections(label_by_color(frame, detections, self.config.layers))
 
     def process_detections(self, detections: Detections) -> Fix:
-        """Light door: detections from another detector, or from `process`."""
+        """Light door: detections from another detector, or from `process`.
+
+        A stamp that does not follow the one before gives no fix; the stamp after it is measured against it, so that a
+        clock that was set back costs one frame and the history.
+        """
         if self.cold:
             self.forget()
         last, self._last_t_ns = self._last_t_ns, detections.t_ns
         if last is not None and detections.t_ns <= last:
             return self._no_fix(detections, "bad_stamp")
+        if len(detections) > self.config.max_spots:
+            return self._no_fix(detections, "too_many")
         light, answers = self._locate(detections)
         poses = {answer.pose.layer: answer.pose for answer in answers if answer.pose is not None}
         guide = self._guidance.choose(poses)
@@ -82,10 +89,11 @@ class PaperLocalizer:
 
     def _split(self, detections: Detections) -> list[np.ndarray]:
         """Which spots (N,) belong to each layer, front first."""
+        inside = self.camera.contains(detections.uv)
         if len(self._layers) == 1:
-            return [np.ones(len(detections), bool)]
+            return [inside]
         rear = self._discriminator.rear(detections)
-        return [~rear, rear]
+        return [inside & ~rear, inside & rear]
 
     def _no_fix(self, detections: Detections, reason: str) -> Fix:
         return Fix(
@@ -97,6 +105,21 @@ class PaperLocalizer:
             reason=reason,
             match=Match(detections, np.full(len(detections), -1, np.int64)),
         )
+
+
+def _check(station: Station, config: PaperConfig) -> None:
+    """Refuse what the method was not made for. Raises: InputError."""
+    if len(station.layers) > 2:
+        raise InputError(f"{station.name}: {len(station.layers)} layers; the paper's method knows at most two")
+    for layer in station.layers:
+        xy = station.p_dock[station.lights_of(layer), :2]
+        if not MIN_FOR_SWARM <= len(xy) <= config.max_lights:
+            raise InputError(f"{station.name}: layer {layer} has {len(xy)} lights; wanted 4 to {config.max_lights}")
+        spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
+        if spread[1] < _MIN_SPREAD * spread[0]:
+            raise InputError(f"{station.name}: the lights of layer {layer} lie in a line as seen from the front")
+        if len(np.unique(np.round(xy, 3), axis=0)) < len(xy):
+            raise InputError(f"{station.name}: two lights of layer {layer} stand one behind the other")
 
 
 def _reason(detections: Detections, answers: list[LayerAnswer]) -> str:

@@ -16,11 +16,11 @@ def picture(electrons: Array, sensor: Sensor, rng: np.random.Generator) -> Image
 
     Shot noise (Gaussian limit) and read noise, full well, 12 bit, demosaicing, gamma. Source: EMVA 1288 camera model.
     """
-    noise = rng.standard_normal(electrons.shape, np.float32)
-    noise *= np.sqrt(electrons + np.float32(sensor.read_noise_e**2))
-    noise += electrons
-    noise *= np.float32(_LEVELS / sensor.full_well_e)
-    raw = np.clip(noise, 0, _LEVELS).astype(np.uint16)
+    levels = rng.standard_normal(electrons.shape, np.float32)  # in place from here on: noise, electrons, levels
+    levels *= np.sqrt(electrons + np.float32(sensor.read_noise_e**2))
+    levels += electrons
+    levels *= np.float32(_LEVELS / sensor.full_well_e)
+    raw = np.clip(np.rint(levels, out=levels), 0, _LEVELS).astype(np.uint16)
     bgr = cv2.demosaicing(raw, cv2.COLOR_BayerRGGB2BGR)
     return np.asarray(_gamma_table(sensor.gamma)[bgr])
 

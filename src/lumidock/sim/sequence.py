@@ -1,4 +1,4 @@
-"""Writing of simulated sequences: rendered frames or bare detections, with their truth (design: sequence folder)."""
+"""Writing of simulated sequences: rendered frames or bare detections, with their truth."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ import csv
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from lumidock.camera import Camera, save_camera
 from lumidock.datatypes import Array, Image, Indices
+from lumidock.errors import LumidockError
 from lumidock.geometry import quat_xyzw_from_rotation
 from lumidock.sim import optics, sensor
 from lumidock.sim.scenario import Scenario, spurious_paths, trajectory
@@ -60,10 +63,9 @@ def write_rendered(
     t_ns, poses = trajectory(scenario, np.random.default_rng([seed, 0]))
     (out / "frames").mkdir(parents=True, exist_ok=True)
     job = partial(_write_frame, scenario, station, camera, seed, out)
-    spawn = get_context("spawn")  # a fork would inherit the locks of OpenCV's threads
-    with ProcessPoolExecutor(workers or os.cpu_count(), mp_context=spawn) as pool:
-        rows = []
-        for row in pool.map(job, range(len(t_ns)), chunksize=4):
+    rows = []
+    with _mapping(workers or os.cpu_count() or 1) as mapping:
+        for row in mapping(job, range(len(t_ns))):
             rows.append(row)
             progress(len(rows), len(t_ns))
     names = [f"{number:06d}" for number in range(len(t_ns))]
@@ -74,11 +76,21 @@ def write_rendered(
     return len(t_ns)
 
 
+@contextmanager
+def _mapping(workers: int) -> Iterator[Callable[..., Iterable[Any]]]:
+    """`map`, in this process or over worker processes."""
+    if workers == 1:
+        yield map
+        return
+    spawn = get_context("spawn")  # a fork would inherit the locks of OpenCV's threads
+    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=cv2.setNumThreads, initargs=(1,)) as pool:
+        yield partial(pool.map, chunksize=4)
+
+
 def _write_frame(
     scenario: Scenario, station: Station, camera: Camera, seed: int, out: Path, number: int
 ) -> tuple[list[list[object]], Array]:
     """Render one frame to its file; returns its rows of lights_truth.csv and its spurious pixels (S, 2)."""
-    cv2.setNumThreads(1)
     t_ns, poses = trajectory(scenario, np.random.default_rng([seed, 0]))
     size = (camera.width, camera.height)
     strays = spurious_paths(scenario, t_ns, size, np.random.default_rng([seed, 2]))[number]
@@ -87,7 +99,9 @@ def _write_frame(
     lit = optics.lamps(scenario, station, camera, poses[number]).lit
     dark = dark_lights(scenario, front[lit[front]], rng)
     image, seen, snr = render_frame(scenario, station, camera, poses[number], strays, dark, rng)
-    cv2.imwrite(str(out / "frames" / f"{number:06d}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    path = out / "frames" / f"{number:06d}.jpg"
+    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]):
+        raise LumidockError(f"{path}: cannot be written")
     rows: list[list[object]] = [
         [light, f"{u:.4f}", f"{v:.4f}", int(s > _VISIBLE_SNR), f"{s:.2f}"]
         for light, (u, v), s in zip(station.ids, seen.uv, snr, strict=True)

@@ -31,11 +31,9 @@ class SpotFrame:
 
 
 def in_view(station: Station, camera: Camera, T_dock_cam: Array) -> tuple[Array, np.ndarray]:
-    """Pixels (M, 2) of all lights and which of them (M,) lie in the picture with the camera inside their beam."""
+    """Pixels (M, 2) of all lights and which of them (M,) lie in the picture and shine toward the camera."""
     uv = project_lights(camera, T_dock_cam, station.p_dock)
-    off_axis = np.arccos(np.clip(emission_cosine(station, T_dock_cam), -1.0, 1.0))
-    lit = off_axis < np.deg2rad(station.beam_deg) / 2.0
-    return uv, camera.contains(uv) & lit
+    return uv, camera.contains(uv) & (emission_cosine(station, T_dock_cam) > 0.0)
 
 
 def emission_cosine(station: Station, T_dock_cam: Array) -> Array:
