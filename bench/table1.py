@@ -31,6 +31,7 @@ PAPER = {
     (0, 2): (99.6, 99.9),
 }
 CONDITIONS = (*PAPER, (1, 1))
+CLEAN_FRAMES = 4  # before the faults begin, in the rows with history
 
 
 @dataclass(slots=True)
@@ -53,15 +54,23 @@ def trials_scenario(missing: int, spurious: int) -> Scenario:
     return load_scenario("trials", settings)
 
 
-def trial(missing: int, spurious: int, seed: int) -> Counts:
-    """One run toward the dock: the swarm alone without history, and the whole method with it."""
+def trial(missing: int, spurious: int, seed: int, *, clean_start: bool = False) -> Counts:
+    """One run toward the dock: the swarm alone without history, and the whole method with it.
+
+    With `clean_start` the faults begin after a few frames without, which are not counted.
+    """
     station, camera = shipped_station(), shipped_camera()
     front = station.lights_of("front")
     alone, whole = LayerLocalizer(station, "front", camera, PaperConfig()), PaperLocalizer(station, camera)
     counts = Counts()
-    for frame in spot_frames(trials_scenario(missing, spurious), station, camera, seed):
-        if frame.in_view[front].all():
-            _count(counts, frame, alone, whole)
+    clean = spot_frames(trials_scenario(0, 0), station, camera, seed)
+    faulty = spot_frames(trials_scenario(missing, spurious), station, camera, seed)
+    in_view = [pair for pair in zip(clean, faulty, strict=True) if pair[1].in_view[front].all()]
+    warming = CLEAN_FRAMES if clean_start else 0
+    for before, _ in in_view[:warming]:
+        whole.process_detections(before.detections)
+    for _, frame in in_view[warming:]:
+        _count(counts, frame, alone, whole)
     return counts
 
 
@@ -82,10 +91,12 @@ def _count(counts: Counts, frame: SpotFrame, alone: LayerLocalizer, whole: Paper
         counts.wrong += not right
 
 
-def condition(missing: int, spurious: int, trials: int = TRIALS, first_seed: int = FIRST_SEED) -> Counts:
+def condition(
+    missing: int, spurious: int, trials: int = TRIALS, first_seed: int = FIRST_SEED, *, clean_start: bool = False
+) -> Counts:
     """All trials of one condition, on all cores."""
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
-        job = partial(trial, missing, spurious)
+        job = partial(trial, missing, spurious, clean_start=clean_start)
         return sum(pool.map(job, range(first_seed, first_seed + trials)), Counts())
 
 
@@ -97,13 +108,15 @@ def main() -> tuple[dict[str, object], list[str]]:
         "|---|---|---|---|---|---|---|---|",
     ]
     content: dict[str, object] = {}
-    for missing, spurious in CONDITIONS:
-        counts = condition(missing, spurious)
-        paper = PAPER.get((missing, spurious), ("-", "-"))
+    rows = [(*condition_, False) for condition_ in CONDITIONS] + [(1, 1, True), (3, 2, True)]
+    for missing, spurious, clean_start in rows:
+        counts = condition(missing, spurious, clean_start=clean_start)
+        paper = ("-", "-") if clean_start else PAPER.get((missing, spurious), ("-", "-"))
         swarm, whole = (100.0 * n / counts.frames for n in (counts.swarm_right, counts.right))
+        name = f"{missing} + {spurious}{', after a clean start' * clean_start}"
         lines.append(
-            f"| {missing} + {spurious} | {counts.frames} | {swarm:.2f} | {paper[0]} | {counts.filter_passes_wrong} "
+            f"| {name} | {counts.frames} | {swarm:.2f} | {paper[0]} | {counts.filter_passes_wrong} "
             f"| {whole:.2f} | {paper[1]} | {counts.wrong} |"
         )
-        content[f"{missing}+{spurious}"] = asdict(counts)
+        content[f"{missing}+{spurious}{'-warm' * clean_start}"] = asdict(counts)
     return content, lines

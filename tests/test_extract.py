@@ -83,6 +83,14 @@ def test_a_light_cut_by_the_edge_keeps_its_centre():
     np.testing.assert_allclose(spots_of(image).uv, [[889, 200]], atol=0.5)
 
 
+@pytest.mark.parametrize("radius", [8, 24, 60])
+@pytest.mark.parametrize("at", [(6, 300), (893, 300), (400, 5), (400, 694)])
+def test_a_blurred_light_cut_by_any_edge_is_found(at, radius):
+    image = canvas()
+    cv2.circle(image, at, radius, 250, -1, cv2.LINE_AA)
+    np.testing.assert_allclose(spots_of(cv2.GaussianBlur(image, (0, 0), 2.0)).uv, [at], atol=0.7)
+
+
 @pytest.mark.parametrize("level", [0, 20, 255])
 def test_an_even_picture_has_no_lights(level):
     assert len(spots_of(np.full((300, 400), level, np.uint8))) == 0

@@ -92,6 +92,57 @@ def test_three_lights_are_enough_with_history():
     assert error(fix, head_on(9.0))[0] < 0.3
 
 
+def test_three_lights_long_after_a_better_fix_are_not_enough():
+    localizer = PaperLocalizer(STATION, CAMERA)
+    for k in range(4):
+        localizer.process_detections(seen_from(head_on(9.6 - 0.15 * k), k * 150_000_000, lights=slice(7)))
+    assert not localizer.process_detections(seen_from(head_on(8.3), 1_300_000_000, lights=[0, 3, 6])).valid
+
+
+def test_clutter_after_a_fix_gives_no_pose_a_second_later(rng):
+    for _ in range(20):
+        localizer = PaperLocalizer(STATION, CAMERA)
+        localizer.process_detections(seen_from(head_on(15.0), lights=slice(7)))
+        uv = rng.uniform([0, 0], [2447, 2047], (80, 2))
+        clutter = Detections.from_uv("1", 10**9, uv, p_rear=np.zeros(80))
+        assert not localizer.process_detections(clutter).valid
+
+
+def test_too_many_spots_are_refused_and_spots_outside_the_picture_ignored(rng):
+    localizer = PaperLocalizer(STATION, CAMERA)
+    many = Detections.from_uv("0", 0, rng.uniform(0, 2000, (500, 2)), p_rear=np.zeros(500))
+    assert localizer.process_detections(many).reason == "too_many"
+    outside = seen_from(head_on(9.0), 10**9, lights=slice(7))
+    assert not localizer.process_detections(replace(outside, uv=outside.uv + 5000.0)).valid
+    with pytest.raises(ValueError, match="finite"):
+        replace(outside, uv=outside.uv * np.nan)
+
+
+@pytest.mark.parametrize(
+    ("p_dock", "word"),
+    [
+        ([[0, 0, 0], [1, 0, 0], [2, 0.01, 0], [3, 0, 0]], "line"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 1, -1]], "behind"),
+        ([[np.cos(a), np.sin(a), 0] for a in np.arange(50)], "50 lights"),
+    ],
+)
+def test_layers_that_the_method_cannot_read_are_refused(p_dock, word):
+    n = len(p_dock)
+    station = replace(
+        STATION,
+        ids=tuple(map(str, range(n))),
+        layers=("front",),
+        layer=np.zeros(n, np.int64),
+        p_dock=np.array(p_dock, float),
+        color=("white",) * n,
+        axis=np.tile([0.0, 0.0, 1.0], (n, 1)),
+        beam_deg=np.full(n, 120.0),
+        power_w=np.ones(n),
+    )
+    with pytest.raises(InputError, match=word):
+        PaperLocalizer(station, CAMERA)
+
+
 def test_clutter_alone_never_gives_a_pose(rng):
     """Random spots in place of a dock: at the shipped tolerances nothing passes, cold."""
     localizer = PaperLocalizer(STATION, CAMERA, cold=True)

@@ -154,7 +154,10 @@ def test_guidance_goes_through_the_four_stages_and_hands_over_at_six_rear_lights
         ({"front": 6, "rear": 5}, "transition", "front"),
         ({"front": 7, "rear": 6}, "transition", "rear"),
         ({"front": 5, "rear": 4}, "transition", "rear"),  # once handed over, it stays
+        ({"front": 7, "rear": 3}, "transition", "front"),  # but not on three lights beside a better layer
         ({}, "transition", None),
+        ({"front": 7}, "front", "front"),
+        ({"front": 7, "rear": 5}, "transition", "rear"),
         ({"rear": 4}, "rear", "rear"),
         ({"rear": 6}, "rear", "rear"),
     ]
