@@ -1,12 +1,14 @@
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,11 +19,13 @@ from test_sources import write_video
 
 from lumidock import cli
 from lumidock.camera import save_camera
+from lumidock.datatypes import Fix, Guide, Protection
 from lumidock.sim.scenario import shipped_scenarios
 
 LUMIDOCK = str(Path(sys.executable).with_name("lumidock"))
 PLAIN = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
 COMMANDS = ("run", "sim", "eval", "demo")
+PAPER = ("--method", "paper")
 SET = [word for setting in SETTINGS for word in ("--set", setting)]
 
 
@@ -65,7 +69,7 @@ def sequence(bare, tmp_path):
 @pytest.fixture
 def earlier(lumidock, bare, tmp_path):
     """An earlier run."""
-    assert lumidock("run", bare, "--out", tmp_path / "earlier")[0] == 0
+    assert lumidock("run", bare, *PAPER, "--out", tmp_path / "earlier")[0] == 0
     return tmp_path / "earlier"
 
 
@@ -151,9 +155,9 @@ def test_pictures_from_simulation_to_evaluation(lumidock, tmp_path):
     simulated = lumidock("sim", "approach", *files, *SET, "--out", tmp_path / "sim")
     assert simulated == (0, f"7 frames written to {tmp_path / 'sim'}\n", "")
 
-    code, out, err = lumidock("run", tmp_path / "sim", "--out", tmp_path / "run")
+    code, out, err = lumidock("run", tmp_path / "sim", *PAPER, "--out", tmp_path / "run")
     assert (code, err) == (0, "")
-    assert "fixes in 7 frames" in out
+    assert re.fullmatch(r"7 frames: [67] valid, 0 guide only, [01] no fix; written to .*\n(not valid: .*\n)?", out)
     code, out, err = lumidock("eval", tmp_path / "run", tmp_path / "sim")
     assert (code, err) == (0, "")
     assert "of 7 frames" in out
@@ -161,7 +165,7 @@ def test_pictures_from_simulation_to_evaluation(lumidock, tmp_path):
     assert json.loads(out)["valid"] >= 6
     assert json.loads(out)["error"]["axial_m"]["median"] < 0.1
 
-    folder = ("run", tmp_path / "sim" / "frames", *files, "--fps", "4", "--json")
+    folder = ("run", tmp_path / "sim" / "frames", *files, *PAPER, "--fps", "4", "--json")
     code, out, err = lumidock(*folder, "--out", tmp_path / "images")
     assert (code, err) == (0, "")
     assert json.loads(out)["valid"] >= 6
@@ -176,7 +180,7 @@ def test_a_video_is_run(lumidock, tmp_path):
     text = (tmp_path / "camera.yaml").read_text().replace("2448", "32").replace("2048", "24")
     (tmp_path / "camera.yaml").write_text(text)
     words = ("--camera", tmp_path / "camera.yaml", "--station", "cage-2x2x5", "--out", tmp_path / "run")
-    assert lumidock("run", tmp_path / "dive.mp4", *words)[0] == 0
+    assert lumidock("run", tmp_path / "dive.mp4", *PAPER, *words)[0] == 0
     assert [row["t_ns"] for row in fixes(tmp_path / "run")] == [str(i * 50_000_000) for i in range(6)]
 
 
@@ -184,7 +188,7 @@ def test_shipped_detections_from_simulation_to_evaluation(lumidock, tmp_path):
     assert lumidock("sim", "trials", "--detections", "--out", tmp_path / "sim") == (
         *(0, f"76 frames written to {tmp_path / 'sim'}\n", ""),
     )
-    assert lumidock("run", tmp_path / "sim", "--out", tmp_path / "run")[0] == 0
+    assert lumidock("run", tmp_path / "sim", *PAPER, "--out", tmp_path / "run")[0] == 0
     code, out, _ = lumidock("eval", tmp_path / "run", tmp_path / "sim")
     assert code == 0
     assert {"front:", "rear:", "names:"} <= set(out.split())
@@ -197,6 +201,79 @@ def test_the_same_seed_gives_the_same_sequence(lumidock, tmp_path, seed):
     lumidock("sim", "trials", "--detections", "--seed", seed + 1, "--out", tmp_path / "other")
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
     assert contents(tmp_path / "one") != contents(tmp_path / "other")
+
+
+class Guesser:
+    """A method that says of every frame what the test wants; remembers how it was made."""
+
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+
+    def __init__(self, station, camera, config, cold=False):
+        made = (len(station), camera.width, config, cold)
+        self.made.append(made)
+
+    def process_detections(self, detections):
+        valid, guided = int(detections.frame) in (0, 1, 4), int(detections.frame) in (1, 2, 3)
+        self.T[2, 3] = 4.0 - 0.25 * int(detections.frame)
+        return Fix(
+            *(detections.frame, detections.t_ns, "tracking", "front", len(detections), 5),
+            T_dock_cam=self.T.copy() if valid else None,
+            reason="" if valid else "protection",
+            covariance=0.01 * np.eye(6) if valid else None,
+            protection=Protection(0.1, 0.1, 0.1) if valid else None,
+            guide=Guide(0.0, 0.0, self.T[2, 3], 0.02, 0.2) if guided else None,
+        )
+
+
+@pytest.fixture
+def guesser(monkeypatch):
+    """Stands in for lumidock's own method; the list of how it was made."""
+    monkeypatch.setattr(Guesser, "made", [], raising=False)
+    monkeypatch.setitem(sys.modules, "lumidock.localizer", SimpleNamespace(Localizer=Guesser))
+    return Guesser.made
+
+
+@pytest.mark.parametrize(("words", "cold"), [([], False), (["--method", "lumidock", "--cold"], True)])
+def test_the_method_is_lumidocks_own_unless_told_otherwise(lumidock, guesser, bare, tmp_path, words, cold):
+    (tmp_path / "config.yaml").write_text("paper: {pso: {particles: 40}}\n")
+    run = ("run", bare, *words, "--config", tmp_path / "config.yaml", "--out", tmp_path / "run")
+    code, out, err = lumidock(*run)
+    assert (code, err) == (0, "")
+    assert out.splitlines() == [
+        f"7 frames: 3 valid, 2 guide only, 2 no fix; written to {tmp_path / 'run'}",
+        "not valid: protection 4",
+    ]
+    ((lights, width, config, was_cold),) = guesser
+    assert (lights, width, config.paper.pso.particles, was_cold) == (5, 320, 40, cold)
+    described = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (described["method"], described["cold"], described["counts"]["guide"]) == ("lumidock", cold, 3)
+    assert [row["guide"] for row in fixes(tmp_path / "run")] == ["0", "1", "1", "1", "0", "0", "0"]
+
+
+def test_an_evaluation_tells_what_the_claims_are_worth(lumidock, guesser, bare, tmp_path):
+    assert lumidock("run", bare, "--out", tmp_path / "run")[0] == len(guesser) - 1 == 0
+    code, out, err = lumidock("eval", tmp_path / "run", bare)
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[:3] == [
+        "valid 3 of 7 frames (42.9 %), guide 3 of 7 frames (42.9 %); not valid: protection 4",
+        "longest gap in valid 0.75 s; gaps over 0.45 s: 1",
+        "longest gap in guide 0.25 s; gaps over 0.45 s: 0",
+    ]
+    assert any(line.split()[:4] == ["all", "7", "3", "3"] for line in lines)
+    assert any(re.match(r"guide but over the alert limit \d of 7 frames", line) for line in lines)
+    assert any(re.match(r"error over the protection level: lateral \d of 3, .*, range \d of 3", line) for line in lines)
+    assert any(re.match(r"NEES [\d.]+ over 3 frames, honest is 6: front [\d.]+$", line) for line in lines)
+    assert max(map(len, lines)) <= 120
+
+
+def test_an_evaluation_of_the_papers_method_tells_of_no_claims(lumidock, bare, earlier):
+    code, out, err = lumidock("eval", earlier, bare)
+    assert (code, err) == (0, "")
+    assert "NEES" not in out
+    assert "protection level" not in out
+    assert re.search(r"^valid but over the alert limit 0 of 7 frames$", out, re.MULTILINE)
+    assert re.search(r"^named lights 0\.\d\d px rms", out, re.MULTILINE)
 
 
 # Runs that cannot start
@@ -262,9 +339,9 @@ def not_started(refusal, sequence, earlier):
 
     def check(match, *words):
         before = contents(earlier)
-        assert match in refusal("run", sequence, *words, "--out", earlier, "--force")
+        assert match in refusal("run", sequence, *PAPER, *words, "--out", earlier, "--force")
         assert contents(earlier) == before
-        assert match in refusal("run", sequence, *words, "--out", earlier.with_name("new"))
+        assert match in refusal("run", sequence, *PAPER, *words, "--out", earlier.with_name("new"))
         assert not earlier.with_name("new").exists()
 
     return check
@@ -309,7 +386,7 @@ def test_a_run_without_a_usable_row_is_one_line(refusal, tmp_path, sequence, spo
     if spoil is None:
         spoil = cv2.imencode(".png", np.zeros((300, 400), np.uint8))[1].tobytes()
     (sequence / "frames" / "a.png").write_bytes(spoil)
-    refusal("run", sequence, "--out", tmp_path / "run")
+    refusal("run", sequence, *PAPER, "--out", tmp_path / "run")
     assert [row["reason"] for row in fixes(tmp_path / "run")] == ["bad_frame"] * 7
 
 
@@ -318,16 +395,18 @@ def test_a_run_without_a_usable_row_is_one_line(refusal, tmp_path, sequence, spo
 
 def test_an_existing_folder_needs_force(refusal, lumidock, bare, earlier):
     before = contents(earlier)
-    assert "--force" in refusal("run", bare, "--out", earlier)
+    assert "--force" in refusal("run", bare, *PAPER, "--out", earlier)
     assert contents(earlier) == before
     (earlier / "notes.txt").write_text("mine")
     (earlier / "fixes.csv").write_text("old")
-    assert lumidock("run", bare, "--out", earlier, "--force")[0] == 0
+    assert lumidock("run", bare, *PAPER, "--out", earlier, "--force")[0] == 0
     assert (earlier / "notes.txt").read_text() == "mine"
     assert len(fixes(earlier)) == 7
 
 
-@pytest.mark.parametrize("command", [["run", "SOURCE"], ["sim", "trials", "--detections"], ["demo"]], ids="-".join)
+@pytest.mark.parametrize(
+    "command", [["run", "SOURCE", *PAPER], ["sim", "trials", "--detections"], ["demo"]], ids="-".join
+)
 @pytest.mark.parametrize("force", [[], ["--force"]], ids=["", "force"])
 def test_a_file_in_place_of_the_folder_is_kept(refusal, bare, tmp_path, command, force):
     (tmp_path / "file").write_text("mine")
@@ -340,19 +419,19 @@ def test_a_file_in_place_of_the_folder_is_kept(refusal, bare, tmp_path, command,
 def test_a_folder_that_cannot_be_made_is_one_line(refusal, bare, tmp_path):
     tmp_path.chmod(0o555)
     folder = Path("/proc") if os.geteuid() == 0 else tmp_path  # root may write anywhere else
-    assert str(folder / "run") in refusal("run", bare, "--out", folder / "run")
+    assert str(folder / "run") in refusal("run", bare, *PAPER, "--out", folder / "run")
 
 
 def test_the_source_is_not_written_into(refusal, sequence):
     before = contents(sequence)
-    assert "is the source" in refusal("run", sequence, "--station", "cage-2x2x5", "--out", sequence, "--force")
+    assert "is the source" in refusal("run", sequence, *PAPER, "--station", "cage-2x2x5", "--out", sequence, "--force")
     assert contents(sequence) == before
 
 
 def test_a_runs_own_files_can_be_used_again(lumidock, bare, earlier):
     before = contents(earlier)
     files = ("--station", earlier / "station.yaml", "--camera", earlier / "camera.yaml")
-    assert lumidock("run", bare, *files, "--out", earlier, "--force")[0] == 0
+    assert lumidock("run", bare, *PAPER, *files, "--out", earlier, "--force")[0] == 0
     for name in map(Path, ("station.yaml", "camera.yaml", "trajectory.tum")):
         assert contents(earlier)[name] == before[name]
 
@@ -361,14 +440,14 @@ def test_a_links_target_is_not_overwritten(lumidock, bare, earlier, tmp_path):
     (tmp_path / "mine.yaml").write_text("mine")
     (earlier / "station.yaml").unlink()
     (earlier / "station.yaml").symlink_to(tmp_path / "mine.yaml")
-    assert lumidock("run", bare, "--out", earlier, "--force")[0] == 0
+    assert lumidock("run", bare, *PAPER, "--out", earlier, "--force")[0] == 0
     assert (tmp_path / "mine.yaml").read_text() == "mine"
     assert (earlier / "station.yaml").read_bytes() == (bare / "station.yaml").read_bytes()
 
 
 def test_any_folder_name_can_be_told(bare, tmp_path):
     strict = PLAIN | {"PYTHONIOENCODING": "utf-8:strict"}
-    process = start("run", bare, "--out", os.fsencode(tmp_path) + b"/\xff", text=False, env=strict)
+    process = start("run", bare, *PAPER, "--out", os.fsencode(tmp_path) + b"/\xff", text=False, env=strict)
     out, err = process.communicate(timeout=30)
     assert (process.returncode, err) == (0, b"")
     assert b"7 frames" in out
@@ -477,7 +556,7 @@ def whole_rows(folder):
 
 def stopped(folder, long, number):
     """A run stopped by a signal after some rows: its process."""
-    process = start("run", long, "--out", folder)
+    process = start("run", long, *PAPER, "--out", folder)
     wait_for(lambda: (folder / "fixes.csv").exists() and (folder / "fixes.csv").read_text().count("\n") > 20)
     os.killpg(process.pid, number)
     return process, *process.communicate(timeout=30)

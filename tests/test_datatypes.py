@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lumidock.datatypes import Detections, Fix, Frame, Match, require_shape
+from lumidock.datatypes import Attitude, Detections, Fix, Frame, Guide, Match, Protection, require_shape
 
 THREE = Detections.from_uv("a.png", 5, np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))
 T = np.eye(4)
@@ -58,6 +58,29 @@ def test_detections_of_unequal_length_are_refused(name):
         replace(THREE, **{name: getattr(THREE, name)[:2]})
 
 
+def test_a_centres_covariance_is_a_matrix_each():
+    assert replace(THREE, cov_px2=np.ones((3, 2, 2))).cov_px2.shape == (3, 2, 2)
+    with pytest.raises(ValueError, match="cov_px2 has shape"):
+        replace(THREE, cov_px2=np.ones((2, 2, 2)))
+
+
+@pytest.mark.parametrize(
+    ("R", "sigma_rad", "match"),
+    [
+        (np.eye(4), 0.1, "R_dock_cam has shape"),
+        (np.diag([1.0, np.nan, 1.0]), 0.1, "finite rotation"),
+        (np.eye(3), 0.0, "positive sigma"),
+        (np.eye(3), -0.1, "positive sigma"),
+        (np.eye(3), np.nan, "positive sigma"),
+        (np.eye(3), np.inf, "positive sigma"),
+    ],
+)
+def test_an_attitude_is_a_rotation_with_an_error(R, sigma_rad, match):
+    assert Attitude(np.eye(3), 0.1).sigma_rad == 0.1
+    with pytest.raises(ValueError, match=match):
+        Attitude(R, sigma_rad)
+
+
 @pytest.mark.parametrize("light", [[0, 1, 2], [7, -1, -1], [-1, -1, -1]])
 def test_a_match_names_each_light_once(light):
     assert Match(THREE, np.array(light)).light.tolist() == light
@@ -74,6 +97,13 @@ def test_a_fix_is_valid_when_it_has_a_pose():
     assert not Fix("a.png", 5, "none", "search", reason="no_lights").valid
 
 
+def test_a_guide_may_come_with_a_pose_or_without():
+    guide = Guide(0.1, -0.1, 20.0, 0.01, 0.5)
+    assert not Fix("a.png", 5, "tracking", "front", reason="protection", guide=guide).valid
+    whole = Fix("a.png", 5, "tracking", "front", 0, 0, T, "", None, (), np.eye(6), Protection(0.1, 0.2, 0.03), guide)
+    assert (whole.valid, whole.protection.axial_m, whole.guide.range_m) == (True, 0.2, 20.0)
+
+
 @pytest.mark.parametrize(
     ("fields", "match"),
     [
@@ -81,6 +111,9 @@ def test_a_fix_is_valid_when_it_has_a_pose():
         ({"T_dock_cam": T, "reason": "mirror"}, "either a pose or the reason"),
         ({"T_dock_cam": T[:3]}, "has shape"),
         ({"T_dock_cam": T * np.nan}, "not finite"),
+        ({"T_dock_cam": T, "covariance": np.eye(3)}, "covariance has shape"),
+        ({"reason": "mirror", "covariance": np.eye(6)}, "neither a covariance"),
+        ({"reason": "mirror", "protection": Protection(1.0, 1.0, 0.1)}, "neither a covariance"),
         ({"T_dock_cam": T + np.diag([np.inf, 0, 0, 0])}, "not finite"),
     ],
 )

@@ -1,4 +1,5 @@
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,9 +7,10 @@ import yaml
 from conftest import assert_close, refused
 from test_run import LIGHTS, STATION
 
-from lumidock.datatypes import Detections, Fix, LayerPose, Match
-from lumidock.geometry import quat_xyzw_from_rotation, so3_exp
-from lumidock.metrics import evaluate, layer_offset_m, true_poses
+from lumidock.camera import Camera, save_camera
+from lumidock.datatypes import Detections, Fix, Guide, LayerPose, Match, Protection
+from lumidock.geometry import bearing_and_range, quat_xyzw_from_rotation, so3_exp
+from lumidock.metrics import evaluate, layer_offset_m, stanford, true_poses
 from lumidock.station import load_station
 from lumidock.streams.runfolder import RunFolder
 
@@ -32,8 +34,9 @@ def write_truth(folder, poses):
     (folder / "truth.csv").write_text(TRUTH + "".join(",".join(map(str, row)) + "\n" for row in rows))
 
 
-def write_run(folder, poses, *, t_ns=None, layers=(), lights=None):
+def write_run(folder, poses, *, t_ns=None, layers=(), lights=None, claims=False):
     """A run folder with these poses; None is no fix. `lights` name the detections of each frame, at (10 i, 20)."""
+    claimed = {"covariance": np.eye(6), "protection": Protection(1, 1, 1), "guide": Guide(0.0, 0.0, 9.0, 1.0, 1.0)}
     with RunFolder(folder, NAMES) as run:
         for number, (name, T) in enumerate(poses.items()):
             light = np.array((lights or {}).get(name, []), np.int64)
@@ -43,6 +46,7 @@ def write_run(folder, poses, *, t_ns=None, layers=(), lights=None):
             status, reason = ("none", "too_few") if T is None else ("tracking", "")
             by_layer = tuple(LayerPose(layer, T_layer, 4, "pso") for layer, T_layer in layers if T is not None)
             fix = Fix(name, t, status, "front", T_dock_cam=T, reason=reason, match=match, by_layer=by_layer)
+            fix = replace(fix, **claimed) if claims else fix
             run.add(fix, 1, t_ns=t)
 
 
@@ -150,6 +154,146 @@ def test_a_truth_file_alone_will_do(tmp_path):
     assert_close(true_poses(tmp_path / "other.csv")["a"], pose(1, 2, 3))
 
 
+@pytest.fixture
+def judge_fixes(tmp_path):
+    """Evaluate a run of whole fixes against poses `true`."""
+
+    def evaluate_fixes(fixes, true):
+        write_truth(tmp_path / "truth", true)
+        with RunFolder(tmp_path / "run", NAMES) as run:
+            for fix in fixes:
+                run.add(fix, 1, t_ns=fix.t_ns)
+        return evaluate(tmp_path / "run", tmp_path / "truth")
+
+    return evaluate_fixes
+
+
+def guide_at(T, off=(0.0, 0.0, 0.0)):
+    """A guide of a true pose, wrong by `off` (rad, rad, m)."""
+    return Guide(*np.add(bearing_and_range(T), off), 0.02, 0.5)
+
+
+def fix_at(name, t_ms, T, guide, *, stage="front", reason="", covariance=None, protection=None):
+    t_ns = t_ms * 1_000_000
+    return Fix(
+        *(name, t_ns, "tracking", stage, 5, 5, T, reason), covariance=covariance, protection=protection, guide=guide
+    )
+
+
+def test_a_guide_counts_beside_the_pose(judge_fixes):
+    T, near = pose(0, 0, 20), pose(0, 0, 6)
+    wrong = guide_at(T, (0.0, 0.027, 0.0))  # 1.55 degrees
+    fixes = [
+        fix_at("a", 0, T, guide_at(T)),
+        fix_at("b", 200, None, wrong, reason="protection"),
+        fix_at("c", 1000, None, guide_at(T, (0, 0, 0.6)), reason="protection"),
+        fix_at("d", 1100, None, None, reason="too_few"),
+        fix_at("e", 1500, near, guide_at(near)),
+        fix_at("f", 1700, near, None),
+        fix_at("strange", 1800, near, None),
+    ]
+    result = judge_fixes(fixes, dict.fromkeys("abcd", T) | dict.fromkeys("efg", near))
+    assert [result[name] for name in ("frames", "valid", "guide", "guide_only")] == [7, 4, 4, 2]
+    assert_close([result["availability"][name] for name in ("valid", "guide")], 4 / 7)
+    far, close = result["by_true_z"][1], result["by_true_z"][0]
+    assert [far[name] for name in ("frames", "valid", "guide")] == [4, 1, 3]
+    assert far["availability"] == {"valid": 0.25, "guide": 0.75}
+    assert [close[name] for name in ("frames", "valid", "guide")] == [3, 2, 1]
+    valid, guide = result["continuity"]["valid"], result["continuity"]["guide"]
+    assert_close([valid["longest_gap_s"], guide["longest_gap_s"]], [1.5, 0.8])
+    assert (valid["long_gaps"], guide["long_gaps"]) == (1, 2)
+    assert result["hazardous"]["frames"] == 6
+    assert result["hazardous"]["guide"] == {"any": 1, "bearing": 1, "range": 0}
+    assert result["over_level"]["bearing"] == {"frames": 4, "over": 1}
+    assert result["over_level"]["range"] == {"frames": 4, "over": 1}
+
+
+def test_what_poses_claim_is_held_against_the_truth(judge_fixes):
+    true = {name: pose(0, 0, 3) for name in "abcd"}
+    level, sure = Protection(0.2, 0.2, 0.05), np.diag([0.01, 0.01, 0.01, 1e-4, 1e-4, 1e-4])
+    fixes = [
+        fix_at("a", 0, pose(0.1, 0, 3), None, covariance=sure, protection=level),
+        fix_at("b", 1, pose(0.3, 0, 3), None, covariance=sure, protection=level, stage="rear"),
+        fix_at("c", 2, pose(0, 0, 2.4, (0.0, 0.0, -0.02)), None, covariance=sure, protection=level, stage="rear"),
+        fix_at("d", 3, None, None, reason="ambiguous"),
+    ]
+    result = judge_fixes(fixes, true)
+    assert result["hazardous"]["valid"] == {"any": 1, "lateral": 0, "axial": 1, "angle": 0}
+    assert {name: result["over_level"][name]["over"] for name in ("lateral", "axial", "angle")} == {
+        **dict.fromkeys(("lateral", "axial"), 1),
+        "angle": 0,
+    }
+    assert result["stanford"] == {
+        "lateral": {"nominal": 2, "misleading": 1, "hazardous": 0, "unavailable": 1},
+        "axial": {"nominal": 2, "misleading": 0, "hazardous": 1, "unavailable": 1},
+        "angle": {"nominal": 3, "misleading": 0, "hazardous": 0, "unavailable": 1},
+    }
+    stages = result["nees"]["by_stage"]
+    assert_close([stages["front"]["mean"], stages["rear"]["mean"]], [1.0, (9.0 + 36.0 + 4.0) / 2], atol=1e-5)
+    assert [stages[name]["frames"] for name in ("front", "rear")] == [1, 2]
+
+
+def test_an_honest_covariance_that_went_through_files_has_a_nees_of_six(judge_fixes, rng):
+    sigma = np.array([1.5, 0.4, 0.05, 0.003, 0.1, 0.02])
+    A = rng.normal(size=(6, 9))
+    P = A @ A.T
+    P *= np.outer(sigma, sigma) / np.sqrt(np.outer(np.diag(P), np.diag(P)))
+    names = [str(i) for i in range(500)]
+    true = {name: pose(*rng.normal(size=2), 18, rng.normal(size=3)) for name in names}
+    fixes = []
+    for i, (name, e) in enumerate(zip(names, rng.multivariate_normal(np.zeros(6), P, 500), strict=True)):
+        T = true[name].copy()
+        T[:3, 3] += e[:3]
+        T[:3, :3] = so3_exp(e[3:]) @ T[:3, :3]
+        fixes.append(fix_at(name, i, T, None, covariance=P, protection=Protection(9.0, 1.0, 1.0)))
+    assert_close(judge_fixes(fixes, true)["nees"]["mean"], 6.0, atol=4 * np.sqrt(12 / 500))
+
+
+def test_a_method_that_claims_nothing_is_judged_by_its_errors(judge):
+    found = {"a": pose(0, 0, 9), "b": pose(1.2, 0, 9), "c": None}
+    result = judge(found, {name: pose(0, 0, 9) for name in found})
+    assert (result["guide"], result["availability"]["guide"]) == (0, 0.0)
+    assert result["continuity"]["guide"] == {"longest_gap_s": None, "long_gaps": 0}
+    assert result["hazardous"]["valid"] == {"any": 1, "lateral": 1, "axial": 0, "angle": 0}
+    assert {row["frames"] for row in result["over_level"].values()} == {0}
+    assert result["nees"] == {"frames": 0, "mean": None, "improper": 0, "by_stage": {}}
+    assert "stanford" not in result
+
+
+def test_a_table_of_poses_alone_will_do(tmp_path):
+    T = {"a": pose(0, 0, 9)}
+    write_truth(tmp_path / "truth", T)
+    (tmp_path / "run").mkdir()
+    rows = (tmp_path / "truth" / "truth.csv").read_text().splitlines()
+    lines = (f"{rows[0]},valid,reason", f"{rows[1]},1,")
+    (tmp_path / "run" / "fixes.csv").write_text("\n".join(lines) + "\n")
+    result = evaluate(tmp_path / "run", tmp_path / "truth")
+    assert (result["valid"], result["guide"], result["hazardous"]["valid"]["any"]) == (1, 0, 0)
+
+
+def test_no_rows_have_no_availability(judge):
+    assert judge({}, {"a": pose(0, 0, 9)})["availability"] == {"valid": None, "guide": None}
+
+
+def test_the_residual_is_that_of_named_lights_at_the_estimated_pose(judge, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "station.yaml").write_text(yaml.safe_dump(STATION))
+    # light A at (-0.9, 0.7): seen head-on from 10 m, 1000 px of focal length put it 90 px left of (90, 90), 70 px up
+    save_camera(Camera(200, 200, np.array([[1000.0, 0, 90], [0, 1000.0, 90], [0, 0, 1]])), tmp_path / "run/camera.yaml")
+    T = pose(0, 0, 10)
+    # the spots are at (0, 20), (10, 20); named A the first is exact, the second is off by (10, 0)
+    poses = {"a": T, "b": T, "c": None}
+    result = judge(poses, dict.fromkeys("abc", T), lights={"a": [0], "b": [-1, 0], "c": [0]})
+    assert_close(result["residual_rms_px"], np.sqrt(10.0**2 / 4), atol=1e-4)
+    assert judge({"c": None}, {"c": T}, lights={"c": [0]})["residual_rms_px"] is None
+    assert judge({"a": pose(0, 0, -10)}, {"a": T}, lights={"a": [0]})["residual_rms_px"] is None  # behind the camera
+
+
+def test_the_stanford_regions_can_be_had_alone():
+    counts = stanford(np.array([0.1, 0.3]), np.array([0.2, 0.2]), np.array([0.5, 0.5]))
+    assert counts == {"nominal": 1, "misleading": 1, "hazardous": 0, "unavailable": 0}
+
+
 def spoil(name, column, value):
     """Set a field of the first row of a CSV file below a folder; an empty `column` drops the file's header."""
 
@@ -177,6 +321,12 @@ SPOILS = {
     "word for a number": (spoil("run/fixes.csv", "x_m", "far"), "run/fixes.csv: frame a: could not convert"),
     "empty number": (spoil("run/fixes.csv", "qw", ""), "run/fixes.csv: frame a: could not convert"),
     "number not finite": (spoil("truth/truth.csv", "y_m", "inf"), "truth/truth.csv: frame a: a number is not finite"),
+    "guide without a bearing": (spoil("run/fixes.csv", "bearing_x_rad", ""), "run/fixes.csv: frame a: could not"),
+    "half a covariance": (spoil("run/fixes.csv", "c33", ""), "run/fixes.csv: frame a: could not convert"),
+    "covariance not finite": (spoil("run/fixes.csv", "c00", "nan"), "run/fixes.csv: frame a: a number is not finite"),
+    "word for a level": (spoil("run/fixes.csv", "pl_axial_m", "low"), "run/fixes.csv: frame a: could not convert"),
+    "endless level": (spoil("run/fixes.csv", "pl_range_m", "inf"), "run/fixes.csv: frame a: a number is not finite"),
+    "no camera": (lambda folder: (folder / "run" / "camera.yaml").write_text("a: 1"), "run/camera.yaml: "),
     "no rotation": (spoil("truth/truth.csv", "qx", "0"), "truth/truth.csv: frame a: "),
     "no stamp": (spoil("run/fixes.csv", "t_ns", ""), "run/fixes.csv: t_ns: "),
     "layer without a pose": (spoil("run/layers.csv", "z_m", "?"), "run/layers.csv: frame a: "),
@@ -190,7 +340,9 @@ def test_what_cannot_be_judged_is_refused(tmp_path, change, match):
     T = {"a": pose(0, 0, 9)}
     write_truth(tmp_path / "truth", T)
     write_lights_truth(tmp_path / "truth", ["a,A,0,20,1,9"])
-    write_run(tmp_path / "run", T, lights={"a": [0]}, layers=[("front", T["a"])])
+    write_run(tmp_path / "run", T, lights={"a": [0]}, layers=[("front", T["a"])], claims=True)
+    (tmp_path / "run" / "station.yaml").write_text(yaml.safe_dump(STATION))
+    save_camera(Camera(200, 200, np.diag([1000.0, 1000.0, 1.0])), tmp_path / "run" / "camera.yaml")
     evaluate(tmp_path / "run", tmp_path / "truth")
     change(tmp_path)
     with refused(tmp_path, match):

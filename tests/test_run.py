@@ -6,12 +6,14 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from numpy.testing import assert_array_equal
 
 from lumidock.camera import Camera, load_camera, save_camera
 from lumidock.config import Config
+from lumidock.datatypes import Fix, Guide
 from lumidock.errors import InputError
 from lumidock.paper import PaperLocalizer
-from lumidock.run import Setup
+from lumidock.run import Setup, Summary
 from lumidock.run import run as run_source
 from lumidock.sim.scenario import load_scenario
 from lumidock.sim.sequence import write_detections, write_rendered
@@ -210,6 +212,27 @@ def test_bare_detections_give_fixes(tmp_path):
     described = json.loads((tmp_path / "run" / "run.json").read_text())
     assert described["source"]["kind"] == "detections"
     assert described["inputs_sha256"]["detections.csv"] == sha256(sequence / "detections.csv")
+
+
+def test_frames_with_a_guide_are_counted():
+    guide, T = Guide(0.0, 0.0, 20.0, 0.01, 0.5), np.eye(4)
+    summary = Summary()
+    for reason, pose, found in [("protection", None, guide), ("", T, guide), ("", T, None), ("too_few", None, None)]:
+        fix = Fix("a", 0, "tracking", "front", T_dock_cam=pose, reason=reason, guide=found)
+        summary.count(fix, 1, "")
+    counts = summary.as_dict()
+    assert [counts[name] for name in ("frames", "valid", "guide", "guide_only")] == [4, 2, 2, 1]
+
+
+def test_a_method_is_told_the_attitude_and_the_run_remembers_its_file(tmp_path):
+    sequence = simulate(tmp_path / "bare", bare=True)
+    (sequence / "attitude.csv").write_text("t_ns,qx,qy,qz,qw,sigma_rad\n500000000,1,0,0,0,0.02\n")
+    told = {}
+    run(sequence, tmp_path / "run", on_fix=lambda item, _fix: told.update({item.frame: item.attitude}))
+    assert [name for name, attitude in told.items() if attitude is not None] == ["000002"]
+    assert_array_equal(told["000002"].R_dock_cam, np.diag([1, -1, -1]))
+    described = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert described["inputs_sha256"]["attitude.csv"] == sha256(sequence / "attitude.csv")
 
 
 def test_a_cold_run_knows_no_tracking(rendered, tmp_path):

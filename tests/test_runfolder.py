@@ -4,12 +4,13 @@ import json
 import resource
 from collections import deque
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import assert_close
 
-from lumidock.datatypes import Detections, Fix, LayerPose, Match
+from lumidock.datatypes import Detections, Fix, Guide, LayerPose, Match, Protection
 from lumidock.geometry import pose_from_quat
 from lumidock.streams.runfolder import RunFolder, sha256
 
@@ -90,6 +91,57 @@ def test_a_fix_is_written_whole(write):
     bearing = [float(row[name]) for name in ("bearing_x_rad", "bearing_y_rad", "range_m")]
     assert_close(bearing, [np.arctan2(-1, -2), np.arctan2(-10, -2), np.sqrt(105)], atol=1e-9)
     assert {row[name] for name in row if name.startswith(("c", "pl_"))} == {""}
+
+
+GUIDE = Guide(0.25, -0.5, 12.125, 0.0078125, 0.75)
+COVARIANCE = [name for name in COLUMNS.split(",") if name[0] == "c"]
+LEVELS = ("pl_lateral_m", "pl_axial_m", "pl_angle_rad")
+GUIDANCE = ("bearing_x_rad", "bearing_y_rad", "range_m", "pl_bearing_rad", "pl_range_m")
+
+
+def test_a_covariance_is_written_as_its_upper_triangle(write):
+    A = np.arange(36.0).reshape(6, 6)
+    fix = replace(FIX, covariance=A + A.T, protection=Protection(0.5, 1e-7, 0.03125), guide=GUIDE)
+    (row,) = rows(write((fix, 42, 5)) / "fixes.csv")
+    assert len(COVARIANCE) == 21
+    assert {name: float(row[name]) for name in COVARIANCE} == {
+        name: (A + A.T)[int(name[1]), int(name[2])] for name in COVARIANCE
+    }
+    assert [float(row[name]) for name in LEVELS] == [0.5, 1e-7, 0.03125]
+    assert [float(row[name]) for name in GUIDANCE] == [0.25, -0.5, 12.125, 0.0078125, 0.75]  # not of the pose
+    assert (row["valid"], row["guide"]) == ("1", "1")
+
+
+def test_a_written_covariance_of_a_planar_array_far_away_stays_one(write, rng):
+    # the lateral error is z times the tilt but for a tenth of a millimetre
+    tilt, rest = 0.1 * rng.normal(size=(2, 5000)), rng.normal(size=(6, 5000))
+    errors = rest * np.array([1e-4, 1e-4, 1e-2, 1e-5, 1e-5, 1e-4])[:, None]
+    errors[[0, 4]] += [18.0 * tilt[0], tilt[0]]
+    errors[[1, 3]] += [18.0 * tilt[1], -tilt[1]]
+    covariance = np.cov(errors)
+    (row,) = rows(write((replace(FIX, covariance=covariance), 42, 5)) / "fixes.csv")
+    back = np.zeros((6, 6))
+    back[np.triu_indices(6)] = [float(row[name]) for name in COVARIANCE]
+    back += np.triu(back, 1).T
+    np.linalg.cholesky(back)
+    e = errors[:, 0]
+    assert_close(e @ np.linalg.solve(back, e) / (e @ np.linalg.solve(covariance, e)), 1.0, atol=1e-3)
+
+
+def test_a_guide_without_a_pose_fills_its_own_fields_only(write):
+    fix = Fix("f1", 5, "tracking", "front", reason="protection", guide=GUIDE)
+    folder = write((fix, 42, 5))
+    (row,) = rows(folder / "fixes.csv")
+    assert (row["valid"], row["guide"], row["reason"]) == ("0", "1", "protection")
+    assert [float(row[name]) for name in GUIDANCE] == [0.25, -0.5, 12.125, 0.0078125, 0.75]
+    assert {row[name] for name in (*COVARIANCE, *LEVELS, "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")} == {""}
+    assert (folder / "trajectory.tum").read_text() == ""
+
+
+def test_a_level_that_is_not_finite_is_unknown(write):
+    fix = replace(FIX, protection=Protection(0.5, np.inf, np.nan), guide=replace(GUIDE, pl_range_m=np.inf))
+    (row,) = rows(write((fix, 42, 5)) / "fixes.csv")
+    assert [row[name] for name in (*LEVELS, "pl_range_m")] == ["0.5", "", "", ""]
 
 
 @pytest.mark.parametrize("t_ns", [None, -5])

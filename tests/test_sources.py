@@ -3,8 +3,9 @@ import os
 import cv2
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import assert_close, refused
 from numpy.testing import assert_array_equal
+from scipy.spatial.transform import Rotation
 
 from lumidock.datatypes import Detections, Frame, Unusable
 from lumidock.errors import InputError
@@ -271,3 +272,107 @@ def test_a_broken_number_spoils_its_frame_only(detections, row):
 def test_a_table_of_detections_needs_its_columns(detections, tmp_path):
     with refused(tmp_path / "detections.csv", "no column v_px"):
         detections("", header="frame,u_px\n")
+
+
+ATTITUDE = "t_ns,qx,qy,qz,qw,sigma_rad\n"
+
+
+@pytest.fixture
+def sigmas(tmp_path):
+    """Folder of frames at the given ms; returns (rows of attitude.csv, ms) -> sigma of each frame's attitude."""
+
+    def read(rows, ms, header=ATTITUDE):
+        (tmp_path / "attitude.csv").write_text(header + "".join(f"{row}\n" for row in rows))
+        stamps = (f"{number},,{t * 1_000_000}\n" for number, t in enumerate(ms))
+        (tmp_path / "timestamps.csv").write_text(HEADER.decode() + "".join(stamps))
+        (tmp_path / "detections.csv").write_text(SPOTS + "0,1,2,,,,\n")
+        items = list(open_source(tmp_path).items())
+        return [item.attitude and item.attitude.sigma_rad for item in items]
+
+    return read
+
+
+def at(ms, sigma=0.1):
+    """A row of attitude.csv at a time in ms."""
+    return f"{ms * 1_000_000},0.6,0,0,-0.8,{sigma}"
+
+
+def test_pictures_and_detections_have_the_vehicles_attitude(sequence, sigmas, tmp_path):
+    assert sigmas([at(0, 0.02)], [0]) == [0.02]
+    assert open_source(tmp_path).inputs == tuple(
+        tmp_path / name for name in ("timestamps.csv", "attitude.csv", "detections.csv")
+    )
+    (tmp_path / "detections.csv").unlink()
+    first, second = sequence(HEADER + b"1,a.png,0\n2,b.png,200000000\n")
+    assert_close(first.attitude.R_dock_cam, Rotation.from_quat([0.6, 0, 0, -0.8]).as_matrix())
+    assert (first.attitude.sigma_rad, second.attitude) == (0.02, None)
+    assert open_source(tmp_path).inputs == (tmp_path / "timestamps.csv", tmp_path / "attitude.csv")
+    (tmp_path / "attitude.csv").unlink()
+    assert [item.attitude for item in sequence(HEADER + b"1,a.png,0\n")] == [None]
+
+
+def test_the_nearest_row_within_a_tenth_of_a_second_holds(sigmas):
+    rows = [at(300, 3), at(0, 1), at(120, 2)]  # in any order
+    assert sigmas(rows, [-101, -100, 59, 60, 61, 219, 220, 221, 400, 401]) == [None, 1, 1, 1, 2, 3, 3, 3, 3, None]
+
+
+def test_the_nearest_of_many_rows_holds(sigmas, rng):
+    times, frames = rng.permutation(20_000)[:300].tolist(), sorted(rng.integers(-500, 20_500, 200).tolist())
+    wanted = []
+    for t in frames:
+        off = min((abs(t - row), row) for row in times)
+        wanted.append(off[1] + 1 if off[0] <= 100 else None)
+    assert sigmas([at(t, t + 1) for t in times], frames) == wanted
+
+
+def test_stamps_at_the_ends_of_the_scale_are_compared_exactly(tmp_path, detections):
+    largest = 2**63 - 1
+    (tmp_path / "attitude.csv").write_text(ATTITUDE + f"{-largest},0,0,0,1,1\n{largest},0,0,0,1,2\n")
+    (tmp_path / "timestamps.csv").write_bytes(HEADER + f"1,,{largest - 5}\n2,,{5 - largest}\n3,,0\n".encode())
+    assert [item.attitude and item.attitude.sigma_rad for item in detections("")] == [2, 1, None]
+
+
+BROKEN = {
+    "word": "one,0,0,1,0.1",
+    "empty": ",,,,",
+    "short row": "0,0",
+    "not a number": "nan,0,0,1,0.1",
+    "infinite": "inf,0,0,1,0.1",
+    "huge": "1e200,0,0,1,0.1",
+    "no rotation": "0,0,0,0,0.1",
+    "no error": "0,0,0,1,0",
+    "negative error": "0,0,0,1,-0.1",
+    "error not a number": "0,0,0,1,nan",
+    "endless error": "0,0,0,1,inf",
+    "error too small to square": "0,0,0,1,1e-200",
+}
+
+
+@pytest.mark.parametrize("numbers", BROKEN.values(), ids=BROKEN)
+def test_a_broken_row_leaves_its_frame_without_an_attitude(sigmas, numbers):
+    assert sigmas([at(0), f"50000000,{numbers}", at(100)], [0, 50, 100]) == [0.1, None, 0.1]
+
+
+@pytest.mark.parametrize("stamp", ["", "nan", "1.5", str(2**63), "0x10"])
+def test_a_row_without_a_stamp_is_left_out(sigmas, stamp):
+    assert sigmas([at(0), f"{stamp},0,0,0,1,9"], [0, 50]) == [0.1, 0.1]
+
+
+def test_a_quaternion_of_any_length_is_a_rotation(sigmas, tmp_path):
+    assert sigmas(["0,3,0,0,-4,0.1"], [0]) == [0.1]
+    (item,) = open_source(tmp_path).items()
+    assert_close(item.attitude.R_dock_cam, Rotation.from_quat([0.6, 0, 0, -0.8]).as_matrix())
+
+
+@pytest.mark.parametrize(
+    ("rows", "header", "match"),
+    [
+        ([at(0)], "t_ns,qx,qy,qz,qw,sigma\n", "no column sigma_rad"),
+        ([], "", "no column t_ns"),
+        ([], ATTITUDE, "no usable row"),
+        (["0,0,0,0,0,1", "now,0,0,0,1,1"], ATTITUDE, "no usable row"),
+    ],
+)
+def test_a_table_without_an_attitude_is_refused(sigmas, tmp_path, rows, header, match):
+    with refused(tmp_path / "attitude.csv", match):
+        sigmas(rows, [0], header)

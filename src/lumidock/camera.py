@@ -57,6 +57,19 @@ class Camera:
         """Principal point cx, cy (2,) px."""
         return np.asarray(self.K[:2, 2])
 
+    def lens(self) -> Array:
+        """The flat array (16,) that the kernels project with; see `_kernels.lens`."""
+        flat = np.zeros(16)
+        flat[0] = self.model == "equidistant"
+        flat[1:3], flat[3:5] = self.focal_px, self.center_px
+        flat[5:8] = self._fold, self.width, self.height
+        if self.model == "equidistant":
+            flat[8:12] = self.distortion
+        else:
+            num, den, p1, p2 = _rational_terms(self.distortion)
+            flat[8:16] = *num[1:], *den[1:], p1, p2
+        return flat
+
     def contains(self, uv: Array, *, margin_px: float = 0.0) -> np.ndarray:
         """Whether pixels `uv` (N, 2) lie inside the image by at least `margin_px`; NaN is outside. Returns (N,)."""
         limit = np.array([self.width, self.height]) - 0.5 - margin_px

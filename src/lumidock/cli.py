@@ -15,7 +15,7 @@ from importlib.resources import files
 from itertools import count
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import cv2
 import typer
@@ -29,17 +29,23 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from lumidock.camera import load_camera
+from lumidock.camera import Camera, load_camera
 from lumidock.config import Config, load_config
 from lumidock.datatypes import Fix
 from lumidock.errors import InputError, LumidockError
-from lumidock.station import load_station
+from lumidock.station import Station, load_station
 from lumidock.streams.sources import Item, Source, open_source
+
+if TYPE_CHECKING:
+    from lumidock.run import TwoDoors
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
+_MAX_SEED = 10**9
 _DEFAULT_STATION, _DEFAULT_CAMERA = "cage-2x2x5", "imx264-60deg"
 _SIMULATED = ("frames", "detections.csv", "timestamps.csv", "lights_truth.csv", "spurious_truth.csv")
+
+_SCENARIOS = ", ".join(sorted(Path(entry.name).stem for entry in (files("lumidock") / "sim" / "scenarios").iterdir()))
 
 Out = Annotated[
     Path, typer.Option("--out", metavar="DIR", help="Folder to write; refused when it exists, unless --force.")
@@ -119,7 +125,7 @@ def _run(
     out: Out,
     station: StationOption = None,
     camera: CameraOption = None,
-    method: Annotated[str, typer.Option(metavar="NAME", help="paper: the method of the paper.")] = "paper",
+    method: Annotated[str, typer.Option(metavar="NAME", help="lumidock, or paper.")] = "lumidock",
     cold: Annotated[bool, typer.Option("--cold", help="Forget all history before each frame.")] = False,
     fps: Annotated[
         float | None, typer.Option(metavar="F", help="Frames per second, for sources without time stamps.")
@@ -131,19 +137,16 @@ def _run(
     as_json: AsJson = False,
 ) -> None:
     """Find the camera's pose in every frame of SOURCE."""
-    from lumidock.paper import PaperLocalizer
     from lumidock.run import Setup
     from lumidock.run import run as run_source
     from lumidock.streams.runfolder import RunFolder
 
-    if method != "paper":
-        raise InputError(f"--method {method}: no such method; there is paper")
     opened = open_source(source, fps)
     station_file = _file("station", station, opened.station, opened)
     camera_file = _file("camera", camera, opened.camera, opened)
     settings = load_config(config) if config else Config()
     dock = load_station(station_file)
-    localizer = PaperLocalizer(dock, load_camera(camera_file), settings.paper, cold=cold)
+    localizer = _localizer(method, dock, load_camera(camera_file), settings, cold)
     if out.is_dir() and source.is_dir() and out.samefile(source):
         raise InputError(f"{out}: is the source; write the run elsewhere")
     _prepare(out, force)
@@ -162,14 +165,31 @@ def _run(
     if as_json:
         print(json.dumps(counts, indent=2))
         return
-    print(f"{counts['valid']} fixes in {counts['frames']} frames; written to {out}")
+    none = counts["frames"] - counts["valid"] - counts["guide_only"]
+    print(
+        f"{counts['frames']} frames: {counts['valid']} valid, {counts['guide_only']} guide only, {none} no fix; "
+        f"written to {out}"
+    )
     if counts["reason"]:
-        print("no fix: " + ", ".join(f"{word} {count}" for word, count in sorted(counts["reason"].items())))
+        print("not valid: " + ", ".join(f"{word} {count}" for word, count in sorted(counts["reason"].items())))
+
+
+def _localizer(method: str, station: Station, camera: Camera, config: Config, cold: bool) -> TwoDoors:
+    """The method of that name. Raises: InputError for one that there is not, or a station that it cannot tell apart."""
+    if method == "lumidock":
+        from lumidock.localizer import Localizer
+
+        return Localizer(station, camera, config, cold=cold)
+    if method == "paper":
+        from lumidock.paper import PaperLocalizer
+
+        return PaperLocalizer(station, camera, config.paper, cold=cold)
+    raise InputError(f"--method {method}: no such method; there are lumidock and paper")
 
 
 @app.command("sim")
 def _sim(
-    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="approach, trials, rectangle or a .yaml file.")],
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help=f"{_SCENARIOS}, or a .yaml file.")],
     out: Out,
     seed: Seed = 0,
     settings: Annotated[
@@ -212,6 +232,66 @@ def _eval(
         print(json.dumps(result, indent=2))
     else:
         _print_evaluation(result)
+
+
+@app.command("campaign")
+def _campaign(
+    scenarios: Annotated[list[str], typer.Argument(metavar="SCENARIO...", help=f"{_SCENARIOS}, or .yaml files.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder to write; the same campaign goes on where it was.")
+    ],
+    seeds: Annotated[str, typer.Option(metavar="A:B", help="Seeds A to B - 1, a run of each scenario each.")] = "0:10",
+    methods: Annotated[
+        list[str] | None, typer.Option("--method", metavar="NAME", help="lumidock (default) or paper; may be repeated.")
+    ] = None,
+    cold: Annotated[bool, typer.Option("--cold", help="Forget all history before each frame.")] = False,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY.SUBKEY=VALUE", help="Of all scenarios; may be repeated.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Processes; without it one for each core.")
+    ] = None,
+    cluster: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Run on the dask cluster there: tcp://HOST:PORT.")
+    ] = None,
+    station: StationOption = None,
+    camera: CameraOption = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run scenarios x seeds x methods on bare detections, and count."""
+    from lumidock.campaign import METHODS, markdown, plan, prepare, run_campaign, tabulate
+    from lumidock.sim.scenario import load_scenario
+
+    for method in methods or ():
+        if method not in METHODS:
+            raise InputError(f"--method {method}: no such method; there are {' and '.join(METHODS)}")
+    campaign = plan(
+        [load_scenario(name, tuple(settings or ())) for name in scenarios],
+        methods or METHODS[:1],
+        _seeds(seeds),
+        _shipped_or_path("station", station or _DEFAULT_STATION),
+        _shipped_or_path("camera", camera or _DEFAULT_CAMERA),
+        cold=cold,
+    )
+    prepare(campaign, out, force=force)
+    with _progress("campaign") as progress:
+        speed = run_campaign(campaign, out, workers=workers, cluster=cluster, progress=progress)
+    table = tabulate(campaign, out)
+    if as_json:
+        print(json.dumps(table, indent=1))
+        return
+    print(markdown(table))
+    ran = f"{speed:.0f} frames a second and core" if speed > 0.0 else "nothing was left to do"
+    print(f"{ran}; written to {out}")
+
+
+def _seeds(text: str) -> tuple[int, int]:
+    """The two ends of A:B. Raises: InputError when they hold no seed."""
+    first, _, stop = text.partition(":")
+    if not (first.isdecimal() and stop.isdecimal() and int(first) < int(stop) <= _MAX_SEED):
+        raise InputError(f"--seeds {text}: wanted A:B, whole numbers, A below B")
+    return int(first), int(stop)
 
 
 @app.command("demo")
@@ -357,16 +437,15 @@ def _progress(title: str) -> Iterator[Callable[[int, int | None], None]]:
 
 def _print_evaluation(result: dict[str, Any]) -> None:
     """The evaluation as text: one line a topic, one row a range."""
-    print(f"valid {result['valid']} of {result['frames']} frames; no fix: {result['reasons'] or 'none'}")
-    if result["longest_gap_s"] is not None:
-        print(f"longest gap between fixes {result['longest_gap_s']:.2f} s")
+    print(
+        f"valid {result['valid']} of {_share(result, 'valid')}, guide {result['guide']} of {_share(result, 'guide')}; "
+        f"not valid: {_words(result['reasons'])}"
+    )
+    for word, gaps in result["continuity"].items():
+        if gaps["longest_gap_s"] is not None:
+            print(f"longest gap in {word} {gaps['longest_gap_s']:.2f} s; gaps over 0.45 s: {gaps['long_gaps']}")
     if result["error"]:
-        print(f"{'z, m':>12} {'frames':>7} {'valid':>6}   lateral m       axial m         angle deg   (median / 95 %)")
-        for row in [*result["by_true_z"], {"z_m": None, **result, **result["error"]}]:
-            where = "all" if row["z_m"] is None else f"{row['z_m'][0]:g}..{row['z_m'][1]:g}"
-            errors = (row.get(name) for name in ("lateral_m", "axial_m", "angle_deg"))
-            cells = "  ".join(f"{e['median']:6.3f} /{e['p95']:7.3f}" if e else f"{'-':>15}" for e in errors)
-            print(f"{where:>12} {row['frames']:7d} {row['valid']:6d}   {cells}")
+        _print_ranges(result)
     for layer, content in result.get("layers", {}).items():
         if isinstance(content, dict):
             print(f"{layer}: {content['fixes']} fixes, z {content['first_z_m']:.2f} to {content['last_z_m']:.2f} m")
@@ -374,3 +453,44 @@ def _print_evaluation(result: dict[str, Any]) -> None:
             print(f"largest offset between the layers {content:.3f} m")
     if "labels" in result:
         print(f"names: {result['labels']['named']} given, {result['labels']['wrong']} wrong")
+    if result.get("residual_rms_px") is not None:
+        print(f"named lights {result['residual_rms_px']:.2f} px rms from where the poses put them")
+    _print_trust(result)
+
+
+def _print_ranges(result: dict[str, Any]) -> None:
+    print(f"{'z, m':>12} {'frames':>7} {'valid':>6} {'guide':>6}", end="   ")
+    print("lateral m       axial m         angle deg   (median / 95 %)")
+    for row in [*result["by_true_z"], {"z_m": None, **result, **result["error"]}]:
+        where = "all" if row["z_m"] is None else f"{row['z_m'][0]:g}..{row['z_m'][1]:g}"
+        errors = (row.get(name) for name in ("lateral_m", "axial_m", "angle_deg"))
+        cells = "  ".join(f"{e['median']:6.3f} /{e['p95']:7.3f}" if e else f"{'-':>15}" for e in errors)
+        print(f"{where:>12} {row['frames']:7d} {row['valid']:6d} {row['guide']:6d}   {cells}")
+
+
+def _print_trust(result: dict[str, Any]) -> None:
+    """What the run's own claims are worth."""
+    hazardous = result["hazardous"]
+    for word in ("valid", "guide"):
+        kinds = {kind: count for kind, count in hazardous[word].items() if kind != "any"}
+        print(f"{word} but over the alert limit {hazardous[word]['any']} of {hazardous['frames']} frames", end="")
+        print(f": {_words(kinds)}" if any(kinds.values()) else "")
+    levels = {kind: f"{row['over']} of {row['frames']}" for kind, row in result["over_level"].items() if row["frames"]}
+    if levels:
+        print(f"error over the protection level: {_words(levels)}")
+    nees = result["nees"]
+    if nees["frames"]:
+        stages = {stage: f"{mean['mean']:.2f}" for stage, mean in nees["by_stage"].items()}
+        print(f"NEES {nees['mean']:.2f} over {nees['frames']} frames, honest is 6: {_words(stages)}")
+    if nees["improper"]:
+        print(f"covariances that are none {nees['improper']}")
+
+
+def _words(counts: dict[str, Any]) -> str:
+    return ", ".join(f"{word} {count}" for word, count in counts.items()) or "none"
+
+
+def _share(result: dict[str, Any], word: str) -> str:
+    """The frames of an evaluation, and which share of them is meant."""
+    share = result["availability"][word]
+    return f"{result['frames']} frames" + (f" ({100.0 * share:.1f} %)" if share is not None else "")

@@ -131,10 +131,121 @@ class PaperConfig(Section):
     pose: PoseConfig = PoseConfig()
 
 
+class DetectConfig(Section):
+    """Light detection of the default method; figures without a source were set on rendered approaches."""
+
+    pixel_contrast: PositiveFloat = 5.0  # sigmas by which a tile's largest pixel must clear its background ...
+    contrast: PositiveFloat = 2.0  # ... and the 3 x 3 mean around it, or the tile's, its own ring
+    min_snr: PositiveFloat = 7.8  # of a spot; a small one's is that of a matched filter, in whose place noise reaches 7
+    min_noise: PositiveFloat = 0.7  # grey levels; rounding alone leaves 0.3
+    tile_step: PositiveFloat = 2.0  # grey levels that count as one sigma between tiles, where noise averages out
+    ring_px: PositiveFloat = 8.0  # radius of the ring that is a small spot's background; larger spots take 3 radii
+    max_spots: PositiveInt = 100  # in a frame; the strongest are kept
+    max_candidates: PositiveInt = 6000  # tiles looked at in a frame, the strongest first
+    max_radius: Fraction = 0.06  # of the picture's longer side
+    min_radius_px: PositiveFloat = 0.9  # no lens makes a smaller spot
+    max_work_px: PositiveInt = 1_500_000  # pixels looked at in all spots of a frame
+    small_px: PositiveFloat = 8.0  # up to this radius the centre comes from a Gaussian window
+    min_elongation: Fraction = 0.6  # shorter over longer axis of a round spot; below, its level is raised
+    min_fill: Fraction = 0.85  # area over that of the ellipse with the same moments
+    signal_noise: PositiveFloat = 0.05  # variance of a pixel per grey level of signal: shot noise, mosaic, JPEG
+    floor_px: PositiveFloat = 0.03  # 1 sigma of a centre that has no noise
+    coarse_px: PositiveFloat = 0.06  # the same where blue or red is brightest, and of saturated cores in mono
+    saturated_px: PositiveFloat = 0.04  # added to either, squared, where the core is saturated
+    cut: Fraction = 0.3  # 1 sigma, of the radius, of a centre whose spot the picture's edge cuts
+    glint_radii: PositiveFloat = 3.6  # a spot this near, in radii of the stronger one, ...
+    glint_ratio: PositiveFloat = 2.2  # ... with this many times less flux is a glint, ...
+    glint_trust: PositiveFloat = 0.5  # ... if the stronger looks like a lamp to this share of how much itself does
+
+
+class LabelConfig(Section):
+    """Front or rear by colour: the rear lights are blue, the front ones white."""
+
+    gamma: PositiveFloat = 2.2  # of the camera; ratios of colours mean something only in linear light
+    clear_px: PositiveFloat = 3.0  # beyond a saturated core's edge, where clipping and demosaicing make it white
+    ring: tuple[PositiveFloat, PositiveFloat] = (1.5, 6.0)  # its colour is read up to this many radii + px
+    min_reach_px: PositiveFloat = 2.0  # other spots are read whole, small ones to here
+    blue_ratio: PositiveFloat = 1.0  # blue over the larger of green and red, where both layers are as likely
+    softness: PositiveFloat = 0.15  # of the logarithm of that ratio, without any noise
+    min_signal: PositiveFloat = 3.0  # sigmas of the ring's noise below which nothing is known
+    limit: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.03  # p_rear stays this far from 0 and 1
+
+
+class PriorConfig(Section):
+    """Attitude of the camera about head-on where no sensor gives it, 1 sigma."""
+
+    roll_deg: PositiveFloat = 10.0
+    pitch_deg: PositiveFloat = 15.0
+    yaw_deg: PositiveFloat = 15.0
+
+
+class MatchConfig(Section):
+    """Cold start: the evidence and the decision."""
+
+    noise_px: PositiveFloat = 0.5  # of a centre that comes without a covariance
+    detect: Annotated[float, Field(gt=0, lt=1)] = 0.8  # probability that a light in view is detected
+    layer_absent: Annotated[float, Field(gt=0, lt=1)] = 0.3  # that a layer is not seen at all
+    steady: Annotated[float, Field(ge=0, lt=1)] = 0.7  # share of vehicles that hold head-on better than the prior ...
+    steadier: PositiveFloat = 4.0  # ... by this factor; without an attitude sensor
+    label_trust: Fraction = 0.6  # p_rear counts this much; a label of 0.95 becomes 0.77
+    spurious: PositiveFloat = 5.0  # mean number of spurious spots
+    clutter_near: Fraction = 0.02  # share of spurious spots that stand as close as the detections do
+    clutter_margin_px: PositiveFloat = 100.0
+    gate: PositiveFloat = 18.4  # chi-square, 2 dof, 1e-4
+    bend: PositiveFloat = 0.7  # a tilt of variance s foreshortens by this times s, 1 sigma
+    roll_gate: PositiveFloat = 3.3  # sigma of the prior
+    near_m: PositiveFloat = 0.3
+    far_m: PositiveFloat = 40.0  # of a light
+    hypotheses: PositiveInt = 24
+    log_dock: float = 2.0  # log prior odds that the dock is in view at all
+    max_spots_three: PositiveInt = 14  # among more, three lights of a layer say nothing
+    sure: PositiveFloat = 15.0  # log evidence above which three lights of each layer need not be looked for
+    margin: PositiveFloat = 6.9  # log odds of the names on one frame, ln 1000
+    margin_gathered: PositiveFloat = 9.2  # over frames, or with three lights
+    min_layer: PositiveInt = 3  # fewer lights of a second layer stay unnamed without history: they would set the tilt
+    prune: PositiveFloat = 3.5  # log odds below which a single name is dropped
+    keep: PositiveFloat = 14.0  # candidates this far below the best are forgotten
+    log_mirror: float = -8.1  # log prior of seeing the mirror image alone
+
+
+class TrackConfig(Section):
+    """The filter with history."""
+
+    accel_m_s2: PositiveFloat = 0.3  # white noise on the twist: what a second adds to it, 1 sigma
+    accel_rad_s2: PositiveFloat = 0.05
+    start_m_s: PositiveFloat = 1.5  # 1 sigma of the unknown twist at the start
+    start_rad_s: PositiveFloat = 0.15
+    gate: PositiveFloat = 18.4  # chi-square, 2 dof, 1e-4
+    reach: PositiveFloat = 10.0  # log evidence; namings farther behind the best are not followed
+    max_nodes: PositiveInt = 2000  # of the association's search
+    joint_lights: PositiveInt = 3  # of each of two layers, before survey and calibration are estimated
+    max_gap_s: PositiveFloat = 2.0  # without lights; after it only survey and calibration are kept
+    max_nis: PositiveFloat = 4.0  # sigma of the innovation's chi-square over its mean
+    beliefs: PositiveInt = 6  # poses or namings followed side by side
+    forget: PositiveFloat = 16.0  # log odds at which one is given up
+
+
+class IntegrityConfig(Section):
+    """When a pose may be used."""
+
+    risk: PositiveFloat = 1e-6  # of a frame
+    fault: PositiveFloat = 1e-4  # prior probability that a named light is wrong
+    separate_from: PositiveInt = 6  # lights for one-fault solution separation
+    evidence: PositiveFloat = 13.8  # log odds that stand for the risk, where too few lights can check each other
+    carried_frames: PositiveInt = 5  # frames in a row that stand for it as well
+    max_age_s: PositiveFloat = 0.3  # of the last light
+
+
 class Config(Section):
     """Everything; saved with every run."""
 
     paper: PaperConfig = PaperConfig()
+    prior: PriorConfig = PriorConfig()
+    match: MatchConfig = MatchConfig()
+    track: TrackConfig = TrackConfig()
+    integrity: IntegrityConfig = IntegrityConfig()
+    detect: DetectConfig = DetectConfig()
+    label: LabelConfig = LabelConfig()
 
 
 def load_config(path: Path) -> Config:

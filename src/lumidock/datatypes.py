@@ -30,12 +30,26 @@ def require_shape(name: str, array: np.ndarray, *shape: int | None) -> None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Attitude:
+    """Orientation `R_dock_cam` (3, 3) by the vehicle's own compass and tilt sensors, 1-sigma error `sigma_rad`."""
+
+    R_dock_cam: Array
+    sigma_rad: float
+
+    def __post_init__(self) -> None:
+        require_shape("R_dock_cam", self.R_dock_cam, 3, 3)
+        if not (np.isfinite(self.R_dock_cam).all() and 0.0 < self.sigma_rad < np.inf):
+            raise ValueError("an attitude needs a finite rotation and a positive sigma_rad")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """One picture: `image` (H, W) mono8 or (H, W, 3) bgr8, exposed at `t_ns`; `name` as its source calls it."""
 
     name: str
     t_ns: int
     image: Image
+    attitude: Attitude | None = None
 
     def __post_init__(self) -> None:
         if self.image.dtype != np.uint8:
@@ -49,7 +63,7 @@ class Detections:
 
     `uv` (N, 2) px; `radius_px` (N,) equal-area radius at half peak; `flux` (N,) grey levels summed over the spot;
     `p_light` (N,) probability of being a lamp; `p_rear` (N,) probability of belonging to the rear layer, NaN where
-    nothing is known.
+    nothing is known; `cov_px2` (N, 2, 2) covariance of the centres, None where the detector gives none.
     """
 
     frame: str
@@ -59,6 +73,8 @@ class Detections:
     flux: Array
     p_light: Array
     p_rear: Array
+    cov_px2: Array | None = None
+    attitude: Attitude | None = None
 
     def __post_init__(self) -> None:
         require_shape("uv", self.uv, None, 2)
@@ -66,6 +82,8 @@ class Detections:
             raise ValueError("uv is not finite")
         for name in ("radius_px", "flux", "p_light", "p_rear"):
             require_shape(name, getattr(self, name), len(self.uv))
+        if self.cov_px2 is not None:
+            require_shape("cov_px2", self.cov_px2, len(self.uv), 2, 2)
 
     def __len__(self) -> int:
         return len(self.uv)
@@ -97,8 +115,8 @@ class Match:
 
     def __post_init__(self) -> None:
         require_shape("light", self.light, len(self.detections))
-        named = self.light[self.light >= 0]
-        if len(np.unique(named)) != len(named):
+        named = [light for light in self.light.tolist() if light >= 0]
+        if len(set(named)) != len(named):
             raise ValueError("a light is named twice in one match")
 
 
@@ -112,12 +130,34 @@ class LayerPose:
     source: MatchSource
 
 
+@dataclass(frozen=True, slots=True)
+class Protection:
+    """What the error of a pose exceeds once in 1e6 frames: hypot(ex, ey), |ez| and total rotation."""
+
+    lateral_m: float
+    axial_m: float
+    angle_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Guide:
+    """Bearings atan2(x, z), atan2(y, z) and distance of the dock's origin in `cam`, with their protection levels."""
+
+    bearing_x_rad: float
+    bearing_y_rad: float
+    range_m: float
+    pl_bearing_rad: float
+    pl_range_m: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Fix:
     """The answer for one frame: `T_dock_cam` (4, 4) when `valid`, otherwise no pose and a `reason`.
 
-    `n_seen` counts the frame's detections and `n_used` those behind the pose; `by_layer` holds what each layer said
-    alone, where a method works by layer.
+    `covariance` (6, 6) of [t_est - t_true, w], R_est = Exp(w) R_true, in dock axes, and `protection` come with a pose
+    from a method that knows them. `guide` is there when bearing and range may be used. `n_seen` counts the frame's
+    detections and `n_used` those behind the pose; `by_layer` holds what each layer said alone, where a method works by
+    layer.
     """
 
     frame: str
@@ -130,14 +170,22 @@ class Fix:
     reason: str = ""
     match: Match | None = None
     by_layer: tuple[LayerPose, ...] = field(default=())
+    covariance: Array | None = None
+    protection: Protection | None = None
+    guide: Guide | None = None
 
     def __post_init__(self) -> None:
         if (self.T_dock_cam is None) != bool(self.reason):
             raise ValueError("a fix holds either a pose or the reason why there is none")
-        if self.T_dock_cam is not None:
-            require_shape("T_dock_cam", self.T_dock_cam, 4, 4)
-            if not np.isfinite(self.T_dock_cam).all():
-                raise ValueError("T_dock_cam is not finite")
+        if self.T_dock_cam is None:
+            if self.covariance is not None or self.protection is not None:
+                raise ValueError("without a pose there is neither a covariance nor a protection level")
+            return
+        require_shape("T_dock_cam", self.T_dock_cam, 4, 4)
+        if self.covariance is not None:
+            require_shape("covariance", self.covariance, 6, 6)
+        if not np.isfinite(self.T_dock_cam).all():
+            raise ValueError("T_dock_cam is not finite")
 
     @property
     def valid(self) -> bool:

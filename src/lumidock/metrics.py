@@ -1,4 +1,4 @@
-"""A run against the truth: errors, gaps, labels, and how the two layers agree."""
+"""A run against the truth: errors, availability, gaps, names, how the two layers agree, what its claims are worth."""
 
 from __future__ import annotations
 
@@ -10,10 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from lumidock import trust
+from lumidock.camera import load_camera
 from lumidock.datatypes import Array
 from lumidock.errors import InputError
-from lumidock.geometry import pose_from_quat, se3_inverse, so3_log
+from lumidock.geometry import pose_from_quat, se3_inverse, transform_points
 from lumidock.station import Station, load_station
+from lumidock.streams.runfolder import COVARIANCE_COLUMNS, GUIDE_COLUMNS, PROTECTION_COLUMNS
+from lumidock.trust import GuideClaims, PoseClaims
+from lumidock.trust import stanford as stanford
 
 _POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _SAME_SPOT_PX = 3.0  # a named detection this close to its light's true centre was made by it
@@ -41,22 +46,81 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
     fixes = _rows(path, ("frame", "t_ns", "valid", "reason", *_POSE))
     if fixes and not any(row["frame"] in true for row in fixes):
         raise InputError(f"{truth}: knows none of the run's frames")
-    found = [(row["frame"], _pose(path, row)) for row in fixes if row["valid"] == "1"]
-    common = [name for name, _ in found if name in true]
-    errors = np.array([_error(T, true[name]) for name, T in found if name in true]).reshape(-1, 3)
+    poses = {row["frame"]: _pose(path, row) for row in fixes if row["valid"] == "1"}
+    gaps = {word: trust.continuity(_stamps(path, fixes, word)) for word in ("valid", "guide")}
     result: dict[str, Any] = {
         "frames": len(fixes),
-        "valid": len(found),
+        "valid": _count(fixes, "valid"),
+        "guide": _count(fixes, "guide"),
+        "guide_only": sum(row["valid"] != "1" and row.get("guide") == "1" for row in fixes),
         "reasons": dict(Counter(row["reason"] for row in fixes if row["reason"])),
-        "error": _error_summary(errors),
-        "by_true_z": _by_range(true, common, errors),
-        "longest_gap_s": _longest_gap_s(path, fixes),
+        "longest_gap_s": gaps["valid"]["longest_gap_s"],
+        "continuity": gaps,
     }
+    result["availability"] = _shares(result)
+    result |= _judge(path, [row for row in fixes if row["frame"] in true], true)
     if (run_folder / "layers.csv").exists():
         result["layers"] = _layers(run_folder, true)
     if (folder / "lights_truth.csv").exists():
         result["labels"] = _labels(run_folder, folder, true)
+    if all((run_folder / name).exists() for name in ("lights.csv", "station.yaml", "camera.yaml")):
+        result["residual_rms_px"] = _residual_rms_px(run_folder, poses)
     return result
+
+
+def _judge(path: Path, fixes: list[Row], true: dict[str, Array]) -> dict[str, Any]:
+    """Errors of the fixes that the truth knows, and what their own claims are worth."""
+    valid, guided = ([row for row in fixes if row.get(word) == "1"] for word in ("valid", "guide"))
+    poses, guides = _pose_claims(path, valid, true), _guide_claims(path, guided, true)
+    result: dict[str, Any] = {
+        "error": _error_summary(poses.sizes()),
+        "by_true_z": _by_range(true, valid, guided, poses.sizes()),
+        "hazardous": {"frames": len(fixes), "valid": trust.hazardous(poses), "guide": trust.hazardous(guides)},
+        "over_level": trust.over_level(poses) | trust.over_level(guides),
+        "nees": trust.consistency(poses),
+    }
+    if np.isfinite(poses.levels).any():  # a method without protection levels has no such diagram
+        result["stanford"] = trust.stanford_of(poses, len(fixes))
+    return result
+
+
+def _pose_claims(path: Path, rows: list[Row], true: dict[str, Array]) -> PoseClaims:
+    """The valid rows of fixes.csv against the truth."""
+    T = [_pose(path, row) for row in rows]
+    errors = [trust.pose_error(T_est, true[row["frame"]]) for T_est, row in zip(T, rows, strict=True)]
+    triangles = np.array([_numbers_if_any(path, row, COVARIANCE_COLUMNS) for row in rows]).reshape(-1, 21)
+    return PoseClaims(
+        np.array([T_est[2, 3] for T_est in T]),
+        np.array(errors).reshape(-1, 6),
+        np.array([_numbers_if_any(path, row, PROTECTION_COLUMNS) for row in rows]).reshape(-1, 3),
+        _symmetric(triangles),
+        [row.get("stage", "") for row in rows],
+    )
+
+
+def _guide_claims(path: Path, rows: list[Row], true: dict[str, Array]) -> GuideClaims:
+    """The rows of fixes.csv with a guide against the truth."""
+    return GuideClaims(
+        np.array([_numbers(path, row, GUIDE_COLUMNS[:3]) for row in rows]).reshape(-1, 3),
+        np.array([trust.true_guide(true[row["frame"]]) for row in rows]).reshape(-1, 3),
+        np.array([_numbers_if_any(path, row, GUIDE_COLUMNS[3:]) for row in rows]).reshape(-1, 2),
+    )
+
+
+def _symmetric(triangles: Array) -> Array:
+    """Matrices (N, 6, 6) of their upper triangles (N, 21), row by row."""
+    upper = np.zeros((len(triangles), 6, 6))
+    upper[:, *np.triu_indices(6)] = triangles
+    return np.where(np.tri(6, k=-1, dtype=bool), upper.transpose(0, 2, 1), upper)
+
+
+def _count(fixes: list[Row], word: str) -> int:
+    return sum(row.get(word) == "1" for row in fixes)
+
+
+def _shares(counts: dict[str, Any]) -> dict[str, float | None]:
+    """Availability: the shares of `counts["frames"]` that are valid and that have a guide."""
+    return {word: counts[word] / counts["frames"] if counts["frames"] else None for word in ("valid", "guide")}
 
 
 def _rows(path: Path, columns: tuple[str, ...]) -> list[Row]:
@@ -74,12 +138,17 @@ def _rows(path: Path, columns: tuple[str, ...]) -> list[Row]:
 def _numbers(path: Path, row: Row, names: tuple[str, ...]) -> Array:
     """Fields of a row of `path`, all of them finite."""
     try:
-        values = np.array([float(row[name]) for name in names])
+        values = np.array([float(row.get(name, "")) for name in names])
     except ValueError as error:
         raise InputError(f"{path}: frame {row['frame']}: {error}") from None
     if not np.isfinite(values).all():
         raise InputError(f"{path}: frame {row['frame']}: a number is not finite")
     return values
+
+
+def _numbers_if_any(path: Path, row: Row, names: tuple[str, ...]) -> Array:
+    """The same of fields that are all empty where nothing is known, which is NaN."""
+    return _numbers(path, row, names) if any(row.get(name) for name in names) else np.full(len(names), np.nan)
 
 
 def _pose(path: Path, row: Row) -> Array:
@@ -88,13 +157,6 @@ def _pose(path: Path, row: Row) -> Array:
         return pose_from_quat(values[:3], values[3:])
     except ValueError as error:
         raise InputError(f"{path}: frame {row['frame']}: {error}") from None
-
-
-def _error(T_dock_cam: Array, T_dock_cam_true: Array) -> tuple[float, float, float]:
-    """Lateral m, axial m and total rotation rad."""
-    x, y, z = T_dock_cam[:3, 3] - T_dock_cam_true[:3, 3]
-    angle = np.linalg.norm(so3_log(T_dock_cam[:3, :3] @ T_dock_cam_true[:3, :3].T))
-    return float(np.hypot(x, y)), float(abs(z)), float(angle)
 
 
 def _error_summary(errors: Array) -> dict[str, Any]:
@@ -109,28 +171,27 @@ def _error_summary(errors: Array) -> dict[str, Any]:
     }
 
 
-def _by_range(true: dict[str, Array], common: list[str], errors: Array) -> list[dict[str, Any]]:
-    """Availability and errors over bins of true z."""
-    z_all, z_found = (np.array([true[name][2, 3] for name in names]) for names in (true, common))
+def _by_range(true: dict[str, Array], valid: list[Row], guided: list[Row], errors: Array) -> list[dict[str, Any]]:
+    """Availability and errors over bins of true z; `errors` (N, 3) are those of the rows `valid`."""
+    frames = (true, *([row["frame"] for row in rows] for rows in (valid, guided)))
+    z_all, z_valid, z_guided = (np.array([true[name][2, 3] for name in names]) for names in frames)
     table = []
     for low, high in pairwise(_RANGE_BINS_M):
         top = high + (high == _RANGE_BINS_M[-1]) * 1e-9  # the last range holds its upper end as well
-        frames = int(((z_all >= low) & (z_all < top)).sum())
-        inside = (z_found >= low) & (z_found < top)
-        if frames:
-            table.append(
-                {"z_m": [low, high], "frames": frames, "valid": int(inside.sum())} | _error_summary(errors[inside])
-            )
+        inside_all, inside, inside_guided = ((z >= low) & (z < top) for z in (z_all, z_valid, z_guided))
+        counts = {"frames": inside_all.sum(), "valid": inside.sum(), "guide": inside_guided.sum()}
+        row: dict[str, Any] = {"z_m": [low, high]} | {name: int(count) for name, count in counts.items()}
+        if row["frames"]:
+            table.append(row | {"availability": _shares(row)} | _error_summary(errors[inside]))
     return table
 
 
-def _longest_gap_s(path: Path, fixes: list[Row]) -> float | None:
-    """Longest time between two valid fixes in a row, from the first to the last one."""
+def _stamps(path: Path, fixes: list[Row], word: str) -> list[int]:
+    """Stamps of the rows whose field `word` is 1."""
     try:
-        stamps = [int(row["t_ns"]) for row in fixes if row["valid"] == "1"]
+        return [int(row["t_ns"]) for row in fixes if row.get(word) == "1"]
     except ValueError as error:
         raise InputError(f"{path}: t_ns: {error}") from None
-    return max((b - a for a, b in pairwise(stamps)), default=0) * 1e-9 if len(stamps) > 1 else None
 
 
 def _layers(run_folder: Path, true: dict[str, Array]) -> dict[str, Any]:
@@ -180,3 +241,25 @@ def _labels(run_folder: Path, truth_folder: Path, true: dict[str, Array]) -> dic
         at, seen = lights.get((row["frame"], row["light"])), _numbers(path, row, pixel)
         wrong += at is None or bool(np.hypot(*(at - seen)) > _SAME_SPOT_PX)
     return {"named": len(named), "wrong": wrong}
+
+
+def _residual_rms_px(run_folder: Path, poses: dict[str, Array]) -> float | None:
+    """Rms distance of named detections to where the estimated poses, by frame name, put their lights; per coordinate.
+
+    None without a named detection in a valid frame.
+    """
+    station, camera = load_station(run_folder / "station.yaml"), load_camera(run_folder / "camera.yaml")
+    path, pixel = run_folder / "lights.csv", ("u_px", "v_px")
+    index = {light: i for i, light in enumerate(station.ids)}
+    named: dict[str, list[Row]] = {}
+    for row in _rows(path, ("frame", "light", *pixel)):
+        if row["light"] in index and row["frame"] in poses:
+            named.setdefault(row["frame"], []).append(row)
+    squares = [np.empty(0)]
+    for frame, rows in named.items():
+        p_cam = transform_points(se3_inverse(poses[frame]), station.p_dock[[index[row["light"]] for row in rows]])
+        uv = np.array([_numbers(path, row, pixel) for row in rows])
+        squares.append(((camera.project(p_cam) - uv) ** 2).ravel())
+    seen = np.concatenate(squares)
+    seen = seen[np.isfinite(seen)]
+    return float(np.sqrt(seen.mean())) if len(seen) else None

@@ -38,6 +38,8 @@ class Summary:
     frames: int = 0
     usable: int = 0
     valid: int = 0
+    guide: int = 0
+    guide_only: int = 0
     status: Counter[str] = field(default_factory=Counter)
     stage: Counter[str] = field(default_factory=Counter)
     reason: Counter[str] = field(default_factory=Counter)
@@ -50,6 +52,8 @@ class Summary:
         self.frames += 1
         self.usable += fix.reason not in ("bad_frame", "bad_stamp")
         self.valid += fix.valid
+        self.guide += fix.guide is not None
+        self.guide_only += fix.guide is not None and not fix.valid
         self.status[fix.status] += 1
         self.stage[fix.stage] += fix.valid
         self.reason[fix.reason] += bool(fix.reason)
@@ -65,6 +69,8 @@ class Summary:
             "frames": self.frames,
             "usable": self.usable,
             "valid": self.valid,
+            "guide": self.guide,
+            "guide_only": self.guide_only,
             "status": dict(self.status),
             "valid_by_stage": {name: count for name, count in self.stage.items() if count},
             "reason": {name: count for name, count in self.reason.items() if count},

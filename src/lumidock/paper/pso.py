@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lumidock import _kernels
+from lumidock._kernels.swarm import assign, registration_cost, swarm
 from lumidock.config import PsoConfig
 from lumidock.datatypes import Array, Indices
 from lumidock.paper.normalize import normalize
@@ -42,7 +42,7 @@ def register(
     theta = np.deg2rad(config.theta_deg)
     bounds = np.array([theta, config.scale, config.shift, config.shift])
     placed = np.full(lights.shape, np.nan) if previous is None else previous.placed
-    transform, fitness = _kernels.swarm(
+    transform, fitness = swarm(
         seen,
         lights,
         placed,
@@ -57,8 +57,8 @@ def register(
         config.residual == "all_pairs",
         rng,
     )
-    cost = _kernels.registration_cost(transform, seen, lights, placed, config.w1, config.w2)
-    light = _kernels.assign(cost)
+    cost = registration_cost(transform, seen, lights, placed, config.w1, config.w2)
+    light = assign(cost)
     return Registration(light, transform, float(fitness), _placed(transform, seen, light, len(lights)))
 
 

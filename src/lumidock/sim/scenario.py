@@ -8,19 +8,47 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    model_validator,
+)
 
 from lumidock.datatypes import Array
 from lumidock.errors import InputError
-from lumidock.geometry import so3_exp
 from lumidock.yamlfile import read_mapping, validate
 
 R_DOCK_CAM_HEAD_ON = np.diag([1.0, -1.0, -1.0])
 _MAX_FRAMES = 100_000
+_BETWEEN_DRAWS_S = 60.0  # longer than any history is kept
 Distance = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Count = Annotated[int, Field(ge=0, le=1000)]
 Triple = tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+Angle = Annotated[float, Field(ge=0.0, le=180.0)]
+
+
+def _pair(value: object) -> object:
+    """One number as the range from it to itself."""
+    return value if isinstance(value, (list, tuple)) else (value, value)
+
+
+def _rising(bounds: tuple[Any, Any]) -> tuple[Any, Any]:
+    if bounds[0] > bounds[1]:
+        raise ValueError("wanted the lower bound first")
+    return bounds
+
+
+# a number or a range [lo, hi], from which a draw is uniform
+Counts = Annotated[tuple[Count, Count], BeforeValidator(_pair), AfterValidator(_rising)]
+Lengths = Annotated[tuple[PositiveFloat, PositiveFloat], BeforeValidator(_pair), AfterValidator(_rising)]
+Interval = Annotated[tuple[NonNegativeFloat, NonNegativeFloat], AfterValidator(_rising)]
 
 
 class _Section(BaseModel):
@@ -28,12 +56,17 @@ class _Section(BaseModel):
 
 
 class Path3D(_Section):
-    """The camera's path. `approach` runs along the dock's axis; `rectangle` goes once round at a constant z."""
+    """The camera's path.
 
-    kind: Literal["approach", "rectangle"] = "approach"
+    `approach` runs along the dock's axis; `rectangle` goes once round at a constant z; `draws` are poses that have
+    nothing to do with each other, each with the whole front layer in view.
+    """
+
+    kind: Literal["approach", "rectangle", "draws"] = "approach"
     start_z_m: Distance = 30.0
     end_z_m: Distance = -3.0
     speed_m_s: PositiveFloat = 1.0
+    speed_spread_m_s: NonNegativeFloat = 0.0  # a run's speed is uniform within this of speed_m_s
     frame_interval_s: PositiveFloat = 0.15
     half_width_m: Annotated[float, Field(gt=0, le=1000)] = 9.0  # of the rectangle
     half_height_m: Annotated[float, Field(gt=0, le=1000)] = 7.5
@@ -43,18 +76,33 @@ class Path3D(_Section):
     near_sway_deg: Triple = (0.35, 0.35, 0.5)
     taper_z_m: tuple[float, float] = (15.0, 2.0)  # the sway shrinks between these
     sway_period_s: tuple[PositiveFloat, PositiveFloat] = (7.0, 20.0)
+    count: PositiveInt = 1000  # draws
+    hold: PositiveInt = 1  # frames in a row from each draw, moving toward the dock at speed_m_s
+    hold_deg_s: NonNegativeFloat = 2.0  # largest rate in them about each axis
+    z_m: Lengths = (3.0, 19.0)  # of the draws
+    turn_deg: tuple[Angle, Angle, Angle] = (3.0, 3.0, 3.0)  # largest pitch, yaw, roll of the draws, each uniform
+    tilt_deg: Angle | None = None  # in place of pitch and yaw: angle uniform up to it, in a uniform direction
 
     @model_validator(mode="after")
     def _path_can_be_walked(self) -> Self:
+        if self.speed_spread_m_s >= self.speed_m_s:
+            raise ValueError("speed_spread_m_s: wanted less than speed_m_s")
+        if self.kind == "draws":
+            if self.count * self.hold > _MAX_FRAMES:
+                raise ValueError(f"count times hold is more than {_MAX_FRAMES} frames")
+            if not 1e-6 <= self.frame_interval_s * self.hold <= _BETWEEN_DRAWS_S / 2:
+                raise ValueError(f"frame_interval_s times hold is not within 1e-6 and {_BETWEEN_DRAWS_S / 2:g} s")
+            return self
         length = (
             abs(self.start_z_m - self.end_z_m)
             if self.kind == "approach"
             else 4.0 * (self.half_width_m + self.half_height_m)
         )
-        step = self.speed_m_s * self.frame_interval_s
+        slowest = self.speed_m_s - self.speed_spread_m_s
+        step = slowest * self.frame_interval_s
         if not 0.0 < step < 1e6 or length / step > _MAX_FRAMES:
             raise ValueError(f"speed_m_s times frame_interval_s gives no path of at most {_MAX_FRAMES} frames")
-        if self.frame_interval_s < 1e-6 or length / self.speed_m_s > 1e9:
+        if self.frame_interval_s < 1e-6 or length / slowest > 1e9:
             raise ValueError("stamps of this path do not fit into nanoseconds")
         if self.taper_z_m[0] <= self.taper_z_m[1]:
             raise ValueError("taper_z_m: wanted the farther distance first")
@@ -87,17 +135,44 @@ class Sensor(_Section):
 class Faults(_Section):
     """What goes wrong with the lights."""
 
-    missing: Count = 0  # front lights dark in each frame, drawn anew
-    spurious: Count = 0  # lights that wander over the whole picture
+    missing: Counts = (0, 0)  # front lights dark in each frame, drawn anew; the same ones in frames that are held
+    spurious: Counts = (0, 0)  # lights that wander over the whole picture, drawn for a run; in draws anew in each frame
+
+
+class AttitudeSensor(_Section):
+    """The vehicle's own compass and tilt sensors, 1 sigma about each axis."""
+
+    bias_deg: PositiveFloat = 2.0  # one for a run
+    noise_deg: NonNegativeFloat = 0.1  # in each frame
+
+
+class BlackOuts(_Section):
+    """Times in which no spot is seen at all."""
+
+    at_s: tuple[Interval, ...] = ()  # from and to, since the start
+    count: Counts = (0, 0)  # further ones in a run, anywhere in it ...
+    length_s: Lengths = (0.2, 2.0)  # ... and how long each is
 
 
 class Spots(_Section):
-    """Bare detections, made without rendering."""
+    """Bare detections, made without rendering. What is drawn for a run is drawn for each draw of a path of draws."""
 
     noise_px: NonNegativeFloat = 0.5
-    front_range_m: PositiveFloat = 40.0  # beyond it a layer is not seen
-    rear_range_m: PositiveFloat = 20.0
-    wrong_layer: Probability = 0.0
+    front_range_m: Lengths = (40.0, 40.0)  # from a light; beyond it the light is not seen; drawn for a run
+    rear_range_m: Lengths = (20.0, 20.0)
+    wrong_layer: Probability = 0.0  # of each spot's p_rear; spurious spots look like front lights
+    color: bool = True  # without it p_rear is unknown
+    drop: Probability = 0.0  # of each light, front or rear, in each frame
+    dead: Counts = (0, 0)  # lights, front or rear, that are dark through a run
+    clutter: NonNegativeFloat = 0.0  # mean number of further spurious spots, Poisson and new in each frame
+    place: Literal["picture", "beside"] = "picture"  # of what is drawn anew: beside is the box of the array and 50 %
+    dock: bool = True  # whether it is in view at all
+    mirror: Literal["none", "only"] = "none"  # only: the array is seen in the water surface above it, and not itself
+    surface_m: Lengths = (1.0, 4.0)  # height of the water surface above the dock's origin
+    survey: bool = False  # lights stand off the station's positions by its survey_sigma
+    calibration: bool = False  # the lens is off the camera's by the station's calibration_sigma
+    black_outs: BlackOuts = BlackOuts()
+    attitude: AttitudeSensor | None = None
 
 
 class Scenario(_Section):
@@ -110,6 +185,18 @@ class Scenario(_Section):
     sensor: Sensor = Sensor()
     faults: Faults = Faults()
     spots: Spots = Spots()
+    config: dict[str, Any] = {}  # settings of the method that the scenario needs, as in a configuration file
+
+    @model_validator(mode="after")
+    def _mirrored_camera_can_be_turned(self) -> Self:
+        if self.spots.mirror == "only" and self.path.kind != "draws":
+            raise ValueError("spots.mirror: wanted a path of draws, whose camera looks up at the surface")
+        return self
+
+    @property
+    def shows_dock(self) -> bool:
+        """Whether a spot can be a light of the dock."""
+        return self.spots.dock and self.spots.mirror == "none"
 
 
 def shipped_scenarios() -> list[str]:
@@ -152,34 +239,60 @@ def _apply(content: dict[str, Any], setting: str) -> None:
 
 
 def trajectory(scenario: Scenario, rng: np.random.Generator) -> tuple[np.ndarray, Array]:
-    """Stamps `t_ns` (N,) and true poses `T_dock_cam` (N, 4, 4) of a scenario."""
+    """Stamps `t_ns` (N,) and true poses `T_dock_cam` (N, 4, 4) of a scenario that has a path.
+
+    Raises: InputError for draws, which are no path.
+    """
     path = scenario.path
-    nominal = _approach(path) if path.kind == "approach" else _rectangle(path)
+    if path.kind == "draws":
+        raise InputError(f"{scenario.name}: draws can only be simulated as bare detections (--detections)")
+    speed_m_s = path.speed_m_s
+    if path.speed_spread_m_s:
+        speed_m_s += rng.uniform(-path.speed_spread_m_s, path.speed_spread_m_s)
+    nominal = _approach(path, speed_m_s) if path.kind == "approach" else _rectangle(path, speed_m_s)
     t_s = np.arange(len(nominal)) * path.frame_interval_s
     share = np.clip((nominal[:, 2] - path.taper_z_m[1]) / (path.taper_z_m[0] - path.taper_z_m[1]), 0.0, 1.0)[:, None]
     sway = _wander(t_s, 6, path.sway_period_s, rng)
     shift = sway[:, :3] * (np.array(path.near_sway_m) * (1 - share) + np.array(path.sway_m) * share)
     turn = sway[:, 3:] * np.deg2rad(np.array(path.near_sway_deg) * (1 - share) + np.array(path.sway_deg) * share)
-    T_dock_cam = np.tile(np.eye(4), (len(t_s), 1, 1))
-    T_dock_cam[:, :3, :3] = [R_DOCK_CAM_HEAD_ON @ so3_exp(w) for w in turn]
-    T_dock_cam[:, :3, 3] = nominal + shift
-    return np.round(t_s * 1e9).astype(np.int64), T_dock_cam
+    return np.round(t_s * 1e9).astype(np.int64), poses(R_DOCK_CAM_HEAD_ON @ rotations(turn), nominal + shift)
 
 
-def _approach(path: Path3D) -> Array:
-    count = round(abs(path.start_z_m - path.end_z_m) / (path.speed_m_s * path.frame_interval_s)) + 1
-    z = (
-        path.start_z_m
-        + np.arange(count) * np.sign(path.end_z_m - path.start_z_m) * path.speed_m_s * path.frame_interval_s
-    )
+def rotations(w: Array) -> Array:
+    """Rotation matrices (N, 3, 3) of rotation vectors `w` (N, 3) rad. Source: Rodrigues."""
+    angle = np.linalg.norm(w, axis=1)[:, None, None]
+    W = np.zeros((len(w), 3, 3))
+    W[:, 2, 1], W[:, 0, 2], W[:, 1, 0] = w.T
+    W -= W.transpose(0, 2, 1)
+    first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    return np.asarray(np.eye(3) + first * W + second * (W @ W))
+
+
+def poses(R_dock_cam: Array, t_dock_cam: Array) -> Array:
+    """Poses `T_dock_cam` (N, 4, 4) of rotations (N, 3, 3) and positions (N, 3) m."""
+    T_dock_cam = np.zeros((len(t_dock_cam), 4, 4))
+    T_dock_cam[:, :3, :3], T_dock_cam[:, :3, 3], T_dock_cam[:, 3, 3] = R_dock_cam, t_dock_cam, 1.0
+    return T_dock_cam
+
+
+def draw_stamps(path: Path3D) -> np.ndarray:
+    """Stamps `t_ns` (count, hold) of draws, far enough apart that no history reaches from one to the next."""
+    start, step = np.arange(path.count) * _BETWEEN_DRAWS_S, np.arange(path.hold) * path.frame_interval_s
+    return np.round((start[:, None] + step) * 1e9).astype(np.int64)
+
+
+def _approach(path: Path3D, speed_m_s: float) -> Array:
+    step = speed_m_s * path.frame_interval_s
+    count = round(abs(path.start_z_m - path.end_z_m) / step) + 1
+    z = path.start_z_m + np.arange(count) * np.sign(path.end_z_m - path.start_z_m) * step
     return np.stack([np.zeros(count), np.zeros(count), z], axis=1)
 
 
-def _rectangle(path: Path3D) -> Array:
+def _rectangle(path: Path3D, speed_m_s: float) -> Array:
     w, h = path.half_width_m, path.half_height_m
     corners = np.array([[-w, -h], [-w, h], [w, h], [w, -h], [-w, -h]])
     sides = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    along = np.arange(0.0, sides[-1], path.speed_m_s * path.frame_interval_s)
+    along = np.arange(0.0, sides[-1], speed_m_s * path.frame_interval_s)
     x, y = (np.interp(along, sides, corners[:, axis]) for axis in (0, 1))
     return np.stack([x, y, np.full(len(along), path.start_z_m)], axis=1)
 
@@ -194,6 +307,6 @@ def _wander(t_s: Array, count: int, period_s: tuple[float, float], rng: np.rando
 
 def spurious_paths(scenario: Scenario, t_ns: np.ndarray, size: tuple[int, int], rng: np.random.Generator) -> Array:
     """Pixels (N, S, 2) of the spurious lights, wandering over an image of `size` (width, height)."""
-    count = scenario.faults.spurious
+    count = int(rng.integers(*scenario.faults.spurious, endpoint=True))
     steps = _wander(t_ns * 1e-9, 2 * count, (3.0, 12.0), rng).reshape(len(t_ns), count, 2)
     return np.asarray((0.5 + 0.49 * np.clip(1.6 * steps, -1.0, 1.0)) * np.array(size))

@@ -14,17 +14,19 @@ from typing import Any, Self
 
 import numpy as np
 
-from lumidock.datatypes import Array, Fix
+from lumidock.datatypes import Array, Fix, Protection
 from lumidock.geometry import bearing_and_range, quat_xyzw_from_rotation
 
-_COVARIANCE = tuple(f"c{i}{j}" for i in range(6) for j in range(i, 6))
-_PROTECTION = ("pl_lateral_m", "pl_axial_m", "pl_angle_rad")
+COVARIANCE_COLUMNS = tuple(f"c{i}{j}" for i in range(6) for j in range(i, 6))
+PROTECTION_COLUMNS = ("pl_lateral_m", "pl_axial_m", "pl_angle_rad")
+GUIDE_COLUMNS = ("bearing_x_rad", "bearing_y_rad", "range_m", "pl_bearing_rad", "pl_range_m")
 FIX_COLUMNS = (
     *("frame", "t_ns", "valid", "guide", "status", "stage", "n_seen", "n_used"),
     *("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
-    *_COVARIANCE,
-    *_PROTECTION,
-    *("bearing_x_rad", "bearing_y_rad", "range_m", "pl_bearing_rad", "pl_range_m", "reason", "latency_us"),
+    *COVARIANCE_COLUMNS,
+    *PROTECTION_COLUMNS,
+    *GUIDE_COLUMNS,
+    *("reason", "latency_us"),
 )
 LIGHT_COLUMNS = ("frame", "u_px", "v_px", "radius_px", "flux", "p_light", "p_rear", "light")
 LAYER_COLUMNS = ("frame", "layer", "n_used", "matched_by", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -99,22 +101,46 @@ class RunFolder:
 
 
 def _fix_row(fix: Fix, latency_us: int | None, t_ns: int | None) -> list[object]:
-    head = [
+    return [
         fix.frame,
         "" if t_ns is None else t_ns,
         int(fix.valid),
-        0,
+        int(fix.guide is not None),
         fix.status,
         fix.stage,
         fix.n_seen,
         fix.n_used,
+        *([""] * 7 if fix.T_dock_cam is None else _pose_fields(fix.T_dock_cam)),
+        *_covariance_fields(fix.covariance),
+        *_protection_fields(fix.protection),
+        *_guide_fields(fix),
+        fix.reason,
+        "" if latency_us is None else latency_us,
     ]
-    pose, bearing = [""] * 7, [""] * 3
+
+
+def _covariance_fields(covariance: Array | None) -> list[str]:
+    """The upper triangle row by row; of a planar array far away, whose lateral error goes with its tilt, to the end."""
+    if covariance is None:
+        return [""] * len(COVARIANCE_COLUMNS)
+    return [_short(value, 12) for value in covariance[np.triu_indices(6)]]
+
+
+def _protection_fields(protection: Protection | None) -> list[str]:
+    if protection is None:
+        return [""] * len(PROTECTION_COLUMNS)
+    return [_short(value) for value in (protection.lateral_m, protection.axial_m, protection.angle_rad)]
+
+
+def _guide_fields(fix: Fix) -> list[str]:
+    """Bearings and range, of the pose where the method gives no guide, and their protection levels."""
+    guide = fix.guide
+    if guide is not None:
+        bearing = (guide.bearing_x_rad, guide.bearing_y_rad, guide.range_m)
+        return [*(f"{value:.9f}" for value in bearing), _short(guide.pl_bearing_rad), _short(guide.pl_range_m)]
     if fix.T_dock_cam is not None:
-        pose = _pose_fields(fix.T_dock_cam)
-        bearing = [f"{value:.9f}" for value in bearing_and_range(fix.T_dock_cam)]
-    unknown = [""] * (len(_COVARIANCE) + len(_PROTECTION))
-    return [*head, *pose, *unknown, *bearing, "", "", fix.reason, "" if latency_us is None else latency_us]
+        return [*(f"{value:.9f}" for value in bearing_and_range(fix.T_dock_cam)), "", ""]
+    return [""] * len(GUIDE_COLUMNS)
 
 
 def _pose_fields(T_dock_cam: Array) -> list[str]:
@@ -123,6 +149,10 @@ def _pose_fields(T_dock_cam: Array) -> list[str]:
 
 def _number(value: float) -> str:
     return f"{value:.4f}" if np.isfinite(value) else ""
+
+
+def _short(value: float, digits: int = 9) -> str:
+    return f"{value:.{digits}g}" if np.isfinite(value) else ""
 
 
 def _seconds(t_ns: int) -> str:

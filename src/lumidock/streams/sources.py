@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lumidock.datatypes import Array, Detections, Frame, Unusable
+from lumidock.datatypes import Array, Attitude, Detections, Frame, Unusable
 from lumidock.errors import FrameError, InputError
+from lumidock.geometry import rotation_from_quat_xyzw
 from lumidock.streams.images import SUFFIXES, mono_if_gray, read_image
 
 Item = Frame | Detections | Unusable
@@ -20,6 +22,10 @@ _VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mp
 _INTEGER, _MAX_STAMP = re.compile(r"[+-]?[0-9]{1,19}"), 2**63 - 1
 _FPS_RANGE = (1e-3, 1e6)
 _VIDEO_TINT = 4  # grey levels; decoded gray is off by up to 3
+_ATTITUDE_COLUMNS = ("t_ns", "qx", "qy", "qz", "qw", "sigma_rad")
+_ATTITUDE_REACH_NS = 100_000_000  # a row holds for frames this near to it
+_MAX_ATTITUDE_NUMBER = 1e9  # of a quaternion that may have any length
+_MIN_SIGMA_RAD = 1e-6  # no compass is better, and the inverse square of less overflows
 
 Row = dict[str, str]
 
@@ -58,29 +64,30 @@ def open_source(path: Path, fps: float | None = None) -> Source:
 
 def _open_folder(path: Path, fps: float | None) -> Source:
     camera, station = (file if file.exists() else None for file in (path / "camera.yaml", path / "station.yaml"))
-    stamps, detections = path / "timestamps.csv", path / "detections.csv"
-    if stamps.exists():
-        rows = _read_stamps(stamps)
-        if not rows:
-            raise InputError(f"{stamps}: no frames")
-        if detections.exists():
-            spots = _read_detections(detections)
-            return Source(
-                path,
-                "detections",
-                lambda: _detections(rows, spots),
-                len(rows),
-                camera,
-                station,
-                (stamps, detections),
-            )
-        return Source(path, "sequence", lambda: _sequence(path, rows), len(rows), camera, station, (stamps,))
+    if (path / "timestamps.csv").exists():
+        return _open_sequence(path, camera, station)
     pictures = sorted((file for file in path.iterdir() if file.suffix.lower() in SUFFIXES), key=_in_natural_order)
     if not pictures:
         raise InputError(f"{path}: neither timestamps.csv nor any PNG or JPEG in it")
     if fps is None:
         raise InputError(f"{path}: an image folder has no time stamps; give --fps")
     return Source(path, "images", lambda: _pictures(pictures, fps), len(pictures), camera, station)
+
+
+def _open_sequence(path: Path, camera: Path | None, station: Path | None) -> Source:
+    """A folder with timestamps.csv, and frames/ or detections.csv."""
+    stamps, detections, attitude = path / "timestamps.csv", path / "detections.csv", path / "attitude.csv"
+    rows = _read_stamps(stamps)
+    if not rows:
+        raise InputError(f"{stamps}: no frames")
+    attitudes = _read_attitudes(attitude) if attitude.exists() else _Attitudes([], np.empty((0, 5)))
+    inputs = (stamps, attitude) if attitude.exists() else (stamps,)
+    if detections.exists():
+        spots, inputs = _read_detections(detections), (*inputs, detections)
+        return Source(
+            path, "detections", lambda: _detections(rows, spots, attitudes), len(rows), camera, station, inputs
+        )
+    return Source(path, "sequence", lambda: _sequence(path, rows, attitudes), len(rows), camera, station, inputs)
 
 
 def _read_csv(path: Path, columns: tuple[str, ...]) -> list[Row]:
@@ -109,6 +116,48 @@ def _stamp(text: str) -> int | None:
     return int(text)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Attitudes:
+    """Rows of attitude.csv by rising stamp: `t_ns` and `numbers` (N, 5) quat_xyzw, sigma rad, NaN in a broken row."""
+
+    t_ns: list[int]
+    numbers: Array
+
+    def at(self, t_ns: int) -> Attitude | None:
+        """The attitude of the row nearest to `t_ns`; None where that is broken or too far away."""
+        after = bisect_left(self.t_ns, t_ns)
+        around = range(max(after - 1, 0), min(after + 1, len(self.t_ns)))
+        nearest = min(around, key=lambda i: abs(self.t_ns[i] - t_ns), default=None)
+        if nearest is None or abs(self.t_ns[nearest] - t_ns) > _ATTITUDE_REACH_NS:
+            return None
+        *quat_xyzw, sigma_rad = self.numbers[nearest]
+        if np.isnan(sigma_rad):
+            return None
+        return Attitude(rotation_from_quat_xyzw(np.array(quat_xyzw)), float(sigma_rad))
+
+
+def _read_attitudes(path: Path) -> _Attitudes:
+    """Attitudes by rising stamp; a row without a stamp is left out. Raises: InputError when no row is usable."""
+    rows = [(t_ns, row) for row in _read_csv(path, _ATTITUDE_COLUMNS) if (t_ns := _stamp(row["t_ns"])) is not None]
+    rows.sort(key=lambda pair: pair[0])
+    numbers = np.array([_attitude_numbers(row) for _, row in rows]).reshape(-1, 5)
+    if not np.isfinite(numbers).any():
+        raise InputError(f"{path}: no usable row; wanted {','.join(_ATTITUDE_COLUMNS)}")
+    return _Attitudes([t_ns for t_ns, _ in rows], numbers)
+
+
+def _attitude_numbers(row: Row) -> Array:
+    """Quaternion and sigma (5,) of a row; all NaN when they are no rotation with an error."""
+    try:
+        numbers = np.array([float(row[name]) for name in _ATTITUDE_COLUMNS[1:]])
+        if not ((np.abs(numbers) < _MAX_ATTITUDE_NUMBER).all() and numbers[4] >= _MIN_SIGMA_RAD):
+            raise ValueError("out of range")
+        rotation_from_quat_xyzw(numbers[:4])
+    except ValueError:
+        return np.full(5, np.nan)
+    return numbers
+
+
 def _in_order(rows: list[Row], read: Callable[[Row, int], Item]) -> Iterator[Item]:
     """An item for each row of timestamps.csv; `read` makes it from the row and its stamp."""
     for row in rows:
@@ -123,10 +172,12 @@ def _in_order(rows: list[Row], read: Callable[[Row, int], Item]) -> Iterator[Ite
             yield Unusable(name, t_ns, error.reason, str(error))
 
 
-def _sequence(folder: Path, rows: list[Row]) -> Iterator[Item]:
-    return _in_order(
-        rows, lambda row, t_ns: Frame(row["frame"], t_ns, read_image(_inside(folder / "frames", row["file"])))
-    )
+def _sequence(folder: Path, rows: list[Row], attitudes: _Attitudes) -> Iterator[Item]:
+    def read(row: Row, t_ns: int) -> Item:
+        image = read_image(_inside(folder / "frames", row["file"]))
+        return Frame(row["frame"], t_ns, image, attitudes.at(t_ns))
+
+    return _in_order(rows, read)
 
 
 def _inside(folder: Path, name: str) -> Path:
@@ -144,11 +195,14 @@ def _read_detections(path: Path) -> dict[str, list[Row]]:
     return spots
 
 
-def _detections(rows: list[Row], spots: dict[str, list[Row]]) -> Iterator[Item]:
-    return _in_order(rows, lambda row, t_ns: _frame_detections(row["frame"], t_ns, spots.get(row["frame"], [])))
+def _detections(rows: list[Row], spots: dict[str, list[Row]], attitudes: _Attitudes) -> Iterator[Item]:
+    def read(row: Row, t_ns: int) -> Item:
+        return _frame_detections(row["frame"], t_ns, spots.get(row["frame"], []), attitudes.at(t_ns))
+
+    return _in_order(rows, read)
 
 
-def _frame_detections(name: str, t_ns: int, rows: list[Row]) -> Detections:
+def _frame_detections(name: str, t_ns: int, rows: list[Row], attitude: Attitude | None) -> Detections:
     """Detections from their rows; only the centres are required. Raises: FrameError for a number that is none."""
 
     def column(key: str, default: float = np.nan) -> Array:
@@ -164,7 +218,7 @@ def _frame_detections(name: str, t_ns: int, rows: list[Row]) -> Detections:
         raise FrameError("bad_frame", f"frame {name}: a centre is not a finite number")
     if not all(((p >= 0.0) & (p <= 1.0) | np.isnan(p)).all() for p in (p_light, p_rear)):
         raise FrameError("bad_frame", f"frame {name}: a probability outside 0 to 1")
-    return Detections(name, t_ns, uv, radius_px, flux, p_light, p_rear)
+    return Detections(name, t_ns, uv, radius_px, flux, p_light, p_rear, attitude=attitude)
 
 
 def _in_natural_order(file: Path) -> list[str | int]:

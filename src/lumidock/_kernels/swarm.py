@@ -1,4 +1,4 @@
-"""The hot loops: plain arrays in, plain arrays out, compiled by numba."""
+"""The paper's hot loops: one-to-one assignment and the enhanced particle swarm."""
 
 from __future__ import annotations
 

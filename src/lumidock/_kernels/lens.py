@@ -1,0 +1,155 @@
+"""Projection of one point with its Jacobian, and small dense linear algebra, for the other kernels.
+
+A lens is a flat array (16,): model (0 rational, 1 equidistant), fx, fy, cx, cy, fold, width, height, then k1, k2, k3,
+k4, k5, k6, p1, p2 of the rational model or k1..k4 of the equidistant one.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from lumidock.datatypes import Array
+
+Projection = tuple[bool, float, float, float, float, float, float, float, float]
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _unseen() -> Projection:
+    return False, np.nan, np.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def project(lens: Array, x: float, y: float, z: float) -> Projection:
+    """Whether the lens sees a point in `cam`, its pixel u, v, and the rows du/d(x, y, z), dv/d(x, y, z) px/m."""
+    if lens[0] == 1.0:
+        return _project_equidistant(lens, x, y, z)
+    if not z > 0.0:
+        return _unseen()
+    a, b = x / z, y / z
+    w = a * a + b * b
+    if w >= lens[5] * lens[5]:
+        return _unseen()
+    k = lens[8:14]
+    p1, p2 = lens[14], lens[15]
+    den = 1.0 + w * (k[3] + w * (k[4] + w * k[5]))
+    g = (1.0 + w * (k[0] + w * (k[1] + w * k[2]))) / den
+    dg = (k[0] + w * (2.0 * k[1] + 3.0 * w * k[2]) - g * (k[3] + w * (2.0 * k[4] + 3.0 * w * k[5]))) / den
+    u = a * g + 2.0 * p1 * a * b + p2 * (w + 2.0 * a * a)
+    v = b * g + p1 * (w + 2.0 * b * b) + 2.0 * p2 * a * b
+    uu = (g + 2.0 * a * a * dg + 2.0 * p1 * b + 6.0 * p2 * a) * lens[1] / z
+    cross = 2.0 * a * b * dg + 2.0 * p1 * a + 2.0 * p2 * b
+    uv, vu = cross * lens[1] / z, cross * lens[2] / z
+    vv = (g + 2.0 * b * b * dg + 6.0 * p1 * b + 2.0 * p2 * a) * lens[2] / z
+    uz, vz = -(uu * a + uv * b), -(vu * a + vv * b)
+    return True, u * lens[1] + lens[3], v * lens[2] + lens[4], uu, uv, uz, vu, vv, vz
+
+
+@njit(cache=True, error_model="numpy")
+def _project_equidistant(lens: Array, x: float, y: float, z: float) -> Projection:
+    r = math.sqrt(x * x + y * y)
+    theta = math.atan2(r, z)
+    if theta >= lens[5] or (r == 0.0 and z <= 0.0):
+        return _unseen()
+    k = lens[8:12]
+    w = theta * theta
+    bent = theta * (1.0 + w * (k[0] + w * (k[1] + w * (k[2] + w * k[3]))))
+    slope = 1.0 + w * (3.0 * k[0] + w * (5.0 * k[1] + w * (7.0 * k[2] + w * 9.0 * k[3])))
+    if r < 1e-9 * abs(z):
+        scale = 1.0 / abs(z)
+        return True, x * scale * lens[1] + lens[3], y * scale * lens[2] + lens[4], scale * lens[1], 0.0, 0.0, 0.0, (
+            scale * lens[2]
+        ), 0.0
+    scale, norm2 = bent / r, r * r + z * z
+    radial = slope * z / norm2 - scale
+    a, b = x / r, y / r
+    along = -slope * r / norm2
+    uu, uv = (scale + radial * a * a) * lens[1], radial * a * b * lens[1]
+    vu, vv = radial * a * b * lens[2], (scale + radial * b * b) * lens[2]
+    u, v = x * scale * lens[1] + lens[3], y * scale * lens[2] + lens[4]
+    return True, u, v, uu, uv, along * a * lens[1], vu, vv, along * b * lens[2]
+
+
+@njit(cache=True, error_model="numpy")
+def inside(lens: Array, u: float, v: float, margin_px: float) -> bool:
+    """Whether a pixel lies in the picture by at least `margin_px`."""
+    edge = margin_px - 0.5
+    return edge < u < lens[6] - 0.5 - margin_px and edge < v < lens[7] - 0.5 - margin_px
+
+
+@njit(cache=True, error_model="numpy")
+def factor(A: Array, n: int) -> float:
+    """Cholesky factor of the leading (n, n) of `A`, in place in its lower triangle; log det A, NaN if not positive."""
+    log_det = 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            s = A[i, j]
+            for k in range(j):
+                s -= A[i, k] * A[j, k]
+            if i == j:
+                if not s > 0.0:
+                    return np.nan
+                A[i, i] = math.sqrt(s)
+                log_det += math.log(s)
+            else:
+                A[i, j] = s / A[j, j]
+    return log_det
+
+
+@njit(cache=True, error_model="numpy")
+def solve_factored(L: Array, n: int, b: Array) -> None:
+    """Solve L L^T x = b in place for the leading (n, n) of the factor `L`."""
+    for i in range(n):
+        s = b[i]
+        for k in range(i):
+            s -= L[i, k] * b[k]
+        b[i] = s / L[i, i]
+    for i in range(n - 1, -1, -1):
+        s = b[i]
+        for k in range(i + 1, n):
+            s -= L[k, i] * b[k]
+        b[i] = s / L[i, i]
+
+
+@njit(cache=True, error_model="numpy")
+def invert6(A: Array, L: Array, P: Array) -> float:
+    """Inverse `P` (6, 6) of a symmetric `A` (6, 6), with `L` (6, 6) as work space; log det A, NaN if not positive."""
+    for i in range(6):
+        for j in range(i + 1):
+            L[i, j] = A[i, j]
+    log_det = factor(L, 6)
+    if math.isnan(log_det):
+        return log_det
+    for j in range(6):  # columns of the inverse of L, into the lower triangle of P
+        for i in range(j, 6):
+            s = 1.0 if i == j else 0.0
+            for k in range(j, i):
+                s -= L[i, k] * P[k, j]
+            P[i, j] = s / L[i, i]
+    for i in range(6):  # P = L^-T L^-1, row by row from the top, which needs only rows below
+        for j in range(i + 1):
+            s = 0.0
+            for k in range(i, 6):
+                s += P[k, i] * P[k, j]
+            L[i, j] = s
+    for i in range(6):
+        for j in range(i + 1):
+            P[i, j] = P[j, i] = L[i, j]
+    return log_det
+
+
+@njit(cache=True, error_model="numpy")
+def rotate_exp(R: Array, wx: float, wy: float, wz: float) -> None:
+    """R <- R Exp(w) in place. Source: Sola eq. (135)."""
+    angle = math.sqrt(wx * wx + wy * wy + wz * wz)
+    if angle < 1e-9:
+        a, b = 1.0, 0.5
+    else:
+        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)
+    for i in range(3):
+        r0, r1, r2 = R[i, 0], R[i, 1], R[i, 2]
+        c0, c1, c2 = r1 * wz - r2 * wy, r2 * wx - r0 * wz, r0 * wy - r1 * wx  # row times [w]x
+        d0, d1, d2 = c1 * wz - c2 * wy, c2 * wx - c0 * wz, c0 * wy - c1 * wx
+        R[i, 0], R[i, 1], R[i, 2] = r0 + a * c0 + b * d0, r1 + a * c1 + b * d1, r2 + a * c2 + b * d2

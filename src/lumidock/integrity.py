@@ -1,0 +1,152 @@
+"""May a pose be used: protection levels, alert limits, the two levels of trust and the docking stage."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lumidock._kernels import track as kernel
+from lumidock.config import IntegrityConfig
+from lumidock.datatypes import Array, Guide, Protection, Stage
+from lumidock.match import Plan
+from lumidock.track import Track
+
+# default alert limits: below this z m, metres for the lateral and the axial error each, degrees of rotation
+_NEAR_LIMITS = ((1.5, 0.3, 5.0), (5.0, 0.5, 5.0), (12.0, 1.0, 8.0))
+_FAR_SHARE, _FAR_DEG = 0.10, 10.0  # beyond: a share of z, and degrees
+GUIDE_BEARING_RAD, GUIDE_RANGE_M, GUIDE_RANGE_SHARE = math.radians(1.5), 0.3, 0.10
+GUIDE_FROM_M = 3.0  # nearer to the dock's origin, or past it, bearing and range say nothing and the pose decides
+
+
+def alert_limits(z_m: Array, pl_axial_m: Array) -> tuple[Array, Array]:
+    """Alert limits (m for lateral and axial error each, rad for the total rotation) at estimated z m.
+
+    The strictest limit over z +- `pl_axial_m`; limits rise with z, so it is the one at the near end. Arrays broadcast.
+    """
+    z = np.asarray(z_m) - np.asarray(pl_axial_m)
+    metres, degrees = _FAR_SHARE * z, np.full_like(z, _FAR_DEG)
+    for below, limit_m, limit_deg in reversed(_NEAR_LIMITS):
+        metres, degrees = np.where(z < below, limit_m, metres), np.where(z < below, limit_deg, degrees)
+    return metres, np.deg2rad(degrees)
+
+
+def alert_limit(z_m: float, pl_axial_m: float) -> tuple[float, float]:
+    """`alert_limits` of one pose."""
+    z = z_m - pl_axial_m
+    for below, limit_m, limit_deg in _NEAR_LIMITS:
+        if z < below:
+            return limit_m, math.radians(limit_deg)
+    return _FAR_SHARE * z, math.radians(_FAR_DEG)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bounds:
+    """A pose `T_dock_cam` (4, 4), its covariance (6, 6) in dock axes, its guide and all their protection levels."""
+
+    T_dock_cam: Array
+    covariance: Array
+    protection: Protection
+    guide: Guide
+
+
+def bounds(beliefs: Sequence[Track], config: IntegrityConfig, *, few: bool = False) -> Bounds:
+    """Protection of the first belief, wide enough to hold every other that is likelier than the risk.
+
+    Without a fault the levels are factors on sigma; with six or more lights they also hold when any one of them is at
+    fault (M. Joerger et al., "Solution separation versus residual-based RAIM", 2014).
+    """
+    first = beliefs[0]
+    cov = np.empty((9, 9))
+    pl = _levels(first, config, cov)
+    for other in beliefs[1:]:
+        if first.log_weight - other.log_weight < -math.log(config.risk):
+            apart = _apart(first, other)
+            pl = np.maximum(pl, apart + _levels(other, config, np.empty((9, 9))))
+    T_dock_cam = np.eye(4)
+    T_dock_cam[:3, :3], T_dock_cam[:3, 3] = first.R.T, -(first.R.T @ first.t)
+    x, y, z = first.t.tolist()
+    lateral, axial, angle, bearing, distance = pl.tolist()
+    return Bounds(
+        T_dock_cam,
+        cov[:6, :6],
+        Protection(lateral, axial, angle),
+        Guide(math.atan2(x, z), math.atan2(y, z), math.sqrt(x * x + y * y + z * z), bearing, distance),
+    )
+
+
+def _levels(track: Track, config: IntegrityConfig, cov: Array) -> Array:
+    """Lateral m, axial m, angle rad, bearing rad, range m of one belief; fills `cov` (9, 9)."""
+    used = track.n_used
+    fault_risk = min(config.risk / (config.fault * max(used, 1)), 0.5)
+    return np.array(
+        kernel.levels(
+            track.R, track.t, track.P, track.apart, _factors(config.risk), _factors(fault_risk),
+            used >= config.separate_from, cov,
+        )
+    )
+
+
+_FACTORS: dict[float, Array] = {}
+
+
+def _factors(risk: float) -> Array:
+    """Sigmas (3,) that the length of a normal vector of 1, 2 and 3 dimensions exceeds with probability `risk`."""
+    if risk not in _FACTORS:
+        _FACTORS[risk] = np.array([_factor(lambda k, n=n: _tail(k, n) - risk) for n in (1, 2, 3)])
+    return _FACTORS[risk]
+
+
+def _tail(k: float, dimensions: int) -> float:
+    """Probability that a standard normal vector is longer than `k`."""
+    if dimensions == 2:
+        return math.exp(-0.5 * k * k)
+    one = math.erfc(k / math.sqrt(2.0))
+    return one if dimensions == 1 else one + math.sqrt(2.0 / math.pi) * k * math.exp(-0.5 * k * k)
+
+
+def _factor(excess) -> float:  # type: ignore[no-untyped-def]
+    low, high = 0.0, 40.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if excess(middle) > 0.0 else (low, middle)
+    return high
+
+
+def _apart(a: Track, b: Track) -> Array:
+    """How far two poses lie apart in what the levels bound: lateral, axial, angle, bearing, range (5,)."""
+    at = -(a.R.T @ a.t) + b.R.T @ b.t
+    turn = math.acos(min(max(0.5 * (float(np.trace(a.R.T @ b.R)) - 1.0), -1.0), 1.0))
+    bearing = math.hypot(
+        math.atan2(a.t[0], a.t[2]) - math.atan2(b.t[0], b.t[2]), math.atan2(a.t[1], a.t[2]) - math.atan2(b.t[1], b.t[2])
+    )
+    distance = abs(float(np.linalg.norm(a.t) - np.linalg.norm(b.t)))
+    return np.array([math.hypot(at[0], at[1]), abs(at[2]), turn, bearing, distance])
+
+
+def pose_holds(bound: Bounds) -> bool:
+    """Whether the full pose's protection levels are inside the alert limits."""
+    pl = bound.protection
+    limit_m, limit_rad = alert_limit(float(bound.T_dock_cam[2, 3]), pl.axial_m)
+    return pl.lateral_m < limit_m and pl.axial_m < limit_m and pl.angle_rad < limit_rad
+
+
+def guide_holds(bound: Bounds) -> bool:
+    """Whether bearing and range may be used: by their own limits from afar, near the dock as the pose may."""
+    guide = bound.guide
+    if guide.range_m - guide.pl_range_m < GUIDE_FROM_M or abs(guide.bearing_x_rad) > math.pi / 2.0:
+        return pose_holds(bound)
+    limit_m = max(GUIDE_RANGE_M, GUIDE_RANGE_SHARE * (guide.range_m - guide.pl_range_m))
+    return guide.pl_bearing_rad < GUIDE_BEARING_RAD and guide.pl_range_m < limit_m
+
+
+def stage(track: Track, plan: Plan) -> Stage | None:
+    """Docking stage by the layers that the pose rests on (paper section 2.2); None without a light."""
+    count = np.bincount(plan.layer[track.name >= 0], minlength=plan.n_layers)
+    rear = int(count[plan.is_rear == 1].sum())
+    front = int(count.sum()) - rear
+    if front and rear:
+        return "transition"
+    return "rear" if rear else "front" if front else None

@@ -1,0 +1,211 @@
+"""The default method: one frame, from pixels or detections, to a fix. The only object of it with memory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lumidock import detect, integrity, layers, match, track, verify
+from lumidock.camera import Camera
+from lumidock.config import Config
+from lumidock.datatypes import Array, Detections, Fix, Frame, Match, Stage, Status
+from lumidock.errors import FrameError, InputError
+from lumidock.match import Acquisition, Hypothesis, Spots
+from lumidock.station import Station
+from lumidock.track import Track
+
+_MAX_LIGHTS, _MAX_SPOTS = 128, 200
+
+
+class Localizer:
+    """Frames or detections in, one fix each out; remembers the frames before unless `cold`.
+
+    `beliefs` are the poses that it holds possible, the likeliest first; before a lock they differ in names.
+    """
+
+    def __init__(self, station: Station, camera: Camera, config: Config | None = None, *, cold: bool = False) -> None:
+        """Raises: InputError for a station with more lights than the filter can carry."""
+        if len(station) > _MAX_LIGHTS:
+            raise InputError(f"{station.name}: {len(station)} lights; wanted at most {_MAX_LIGHTS}")
+        self.station, self.camera, self.cold = station, camera, cold
+        self.config = config or Config()
+        self._plan = match.plan(station, camera, self.config.match)
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop all history, as before the first frame."""
+        self.beliefs: list[Track] = []
+        self.locked = False
+        self.margin = 0.0
+        self._stage: Stage = "search"
+        self._last: Detections | None = None
+        self._slow: tuple[Array, Array] | None = None
+
+    def process(self, frame: Frame) -> Fix:
+        """Image door. Raises: FrameError when the image is not of the camera's size."""
+        height, width = frame.image.shape[:2]
+        if (width, height) != (self.camera.width, self.camera.height):
+            wanted = f"{self.camera.width}x{self.camera.height}"
+            raise FrameError("bad_frame", f"frame {frame.name} is {width}x{height}, the calibration {wanted}")
+        detections = detect.lights(frame, self.config.detect)
+        return self.process_detections(layers.label(frame, detections, self.config.label))
+
+    def process_detections(self, detections: Detections) -> Fix:
+        """Light door: detections from another detector, or from `process`."""
+        if self.cold:
+            self.forget()
+        reason = self._refuse(detections)
+        self._last = detections
+        if reason == "bad_stamp":
+            return self._no_fix(detections, "none", reason)
+        self.beliefs = self._predict(detections)
+        if reason:
+            return self._no_fix(detections, "coasting" if self.locked else "none", reason)
+        return self._localize(detections)
+
+    def _localize(self, detections: Detections) -> Fix:
+        """Both doors meet here: warm first, then cold; then what may be said."""
+        seen = match.spots(detections, self._plan, self.config.match)
+        followed = self._follow(seen)
+        if self.locked and followed and self._holds(followed[0], seen):
+            self.beliefs = followed
+            return self._conclude(detections, "tracking")
+        found = self._acquire(detections, seen)
+        if verify.is_answer(found, self.config.match) and self._lock(found, detections, seen):
+            return self._conclude(detections, "acquired")
+        if self.locked:
+            return self._coast(detections, "residual" if followed else _why(detections, found))
+        if not self.cold and self._gather(followed, found, detections, seen):
+            return self._conclude(detections, "acquired")
+        return self._no_fix(detections, "none", _why(detections, found))
+
+    def _predict(self, detections: Detections) -> list[Track]:
+        """All beliefs at the time of this frame; those without lights for too long, or from the future, are dropped."""
+        config, t_ns, later = self.config.track, detections.t_ns, []
+        for belief in self.beliefs:
+            if belief.t_ns < t_ns <= belief.lights_ns + config.max_gap_s * 1e9:
+                moved = track.predict(belief, t_ns, config)
+                later.append(track.attend(moved, detections.attitude) if detections.attitude else moved)
+        if not later:
+            if self.locked and self.beliefs[0].joint:
+                self._slow = track.learned(self.beliefs[0])
+            self.locked = False
+        return later
+
+    def _follow(self, seen: Spots) -> list[Track]:
+        """The beliefs that find lights in this frame, with these taken in, the likeliest first."""
+        followed = []
+        for belief in self.beliefs:
+            found = track.associate(belief, seen, self._plan, self.config)
+            if (found.name >= 0).any():
+                weighed = replace(belief, log_weight=belief.log_weight + found.log_evidence)
+                followed.append(track.update(weighed, found.name, seen, self._plan, self.config.track))
+        return self._likeliest([belief for belief in followed if belief is not None])
+
+    def _likeliest(self, beliefs: list[Track]) -> list[Track]:
+        """The likeliest first, without those that are out of the question or the same as a likelier one."""
+        beliefs = sorted(beliefs, key=lambda belief: -belief.log_weight)
+        kept: list[Track] = []
+        for belief in beliefs[: self.config.track.beliefs]:
+            far_behind = belief.log_weight < beliefs[0].log_weight - self.config.track.forget
+            if not far_behind and not any(track.same(belief, other) for other in kept):
+                kept.append(belief)
+        return kept
+
+    def _holds(self, belief: Track, seen: Spots) -> bool:
+        """Whether a followed belief passes its innovation test and does not leave an array's worth of spots unexplained."""
+        unexplained = len(seen.uv) - belief.n_used
+        return verify.innovation_holds(belief, self.config.track) and (belief.n_used >= 3 or unexplained < 4)
+
+    def _acquire(self, detections: Detections, seen: Spots) -> Acquisition:
+        expected = match.prior(detections.attitude, self.config.prior)
+        return match.acquire(seen, self._plan, self.camera, expected, self.config.match)
+
+    def _start(self, naming: Hypothesis, detections: Detections, seen: Spots) -> Track | None:
+        """A new track from one naming, with what is known of survey and calibration."""
+        expected = match.prior(detections.attitude, self.config.prior)
+        slow = self._slow or track.slow_states(self.station, detections.attitude)
+        begun = track.start(
+            naming.T_cam_dock, naming.name, detections.t_ns, seen, self._plan, expected, slow, self.config.track
+        )
+        return None if begun is None else replace(begun, log_weight=naming.log_evidence)
+
+    def _lock(self, found: Acquisition, detections: Detections, seen: Spots) -> bool:
+        """Believe an answer, its flip and, with history, what contradicts it and is not yet out of the question."""
+        head = found.candidates[0]
+        rivals = [c for c in found.candidates[1:] if verify.contradict(c.name, head.name)]
+        namings = [head, *([found.flipped] if found.flipped else []), *([] if self.cold else rivals[:2])]
+        begun = [self._start(naming, detections, seen) for naming in namings]
+        if begun[0] is None or not verify.innovation_holds(begun[0], self.config.track):
+            return False
+        self.beliefs = self._likeliest([belief for belief in begun if belief is not None])
+        self.locked, self.margin = True, found.margin
+        return True
+
+    def _gather(self, followed: list[Track], found: Acquisition, detections: Detections, seen: Spots) -> bool:
+        """Follow every naming that one frame leaves open until one stands out."""
+        new = [*found.candidates, *([found.flipped] if found.flipped else [])][: self.config.track.beliefs]
+        begun = [self._start(n, detections, seen) for n in new if not any((n.name == b.name).all() for b in followed)]
+        self.beliefs = self._likeliest([*followed, *(belief for belief in begun if belief is not None)])
+        if found.reason == "mirror" or not self.beliefs or not verify.gathered(self.beliefs, self.config):
+            return False
+        self.locked, self.margin = True, 0.0
+        return verify.innovation_holds(self.beliefs[0], self.config.track)
+
+    def _conclude(self, detections: Detections, status: Status) -> Fix:
+        """The fix of the likeliest belief, as far as it can be trusted."""
+        first, config = self.beliefs[0], self.config.integrity
+        bound = integrity.bounds(self.beliefs, config)
+        proven = verify.is_proven(first, self.margin, config)
+        valid = proven and integrity.pose_holds(bound)
+        self._stage = integrity.stage(first, self._plan) or self._stage
+        return Fix(
+            detections.frame,
+            detections.t_ns,
+            status,
+            self._stage,
+            n_seen=len(detections),
+            n_used=first.n_used,
+            T_dock_cam=bound.T_dock_cam if valid else None,
+            reason="" if valid else "protection" if proven else "ambiguous",
+            match=Match(detections, match.light_of(first.name, len(detections))),
+            covariance=bound.covariance if valid else None,
+            protection=bound.protection if valid else None,
+            guide=bound.guide if proven and integrity.guide_holds(bound) else None,
+        )
+
+    def _coast(self, detections: Detections, reason: str) -> Fix:
+        """No light fits: a failed test ends trust at once, a dark frame when the last light is too old."""
+        nothing = np.full(len(self.station), -1, np.int64)
+        self.beliefs = [
+            replace(b, name=nothing, frames=0 if reason == "residual" else b.frames) for b in self.beliefs
+        ]
+        age_s = (detections.t_ns - self.beliefs[0].lights_ns) * 1e-9
+        if reason == "residual" or age_s > self.config.integrity.max_age_s:
+            return self._no_fix(detections, "coasting", "residual" if reason == "residual" else "stale")
+        return self._conclude(detections, "coasting")
+
+    def _refuse(self, detections: Detections) -> str:
+        """The word for a frame that cannot be used, or nothing.
+
+        A stamp that does not follow the one before gives no fix; the next is measured against it, so that a clock that
+        was set back costs one frame and the history.
+        """
+        if self._last is not None and detections.t_ns <= self._last.t_ns:
+            return "bad_stamp"
+        if self._last is not None and len(detections) and np.array_equal(detections.uv, self._last.uv):
+            return "frozen"
+        return "too_many" if len(detections) > _MAX_SPOTS else ""
+
+    def _no_fix(self, detections: Detections, status: Status, reason: str) -> Fix:
+        unnamed = Match(detections, np.full(len(detections), -1, np.int64))
+        frame, t_ns, seen = detections.frame, detections.t_ns, len(detections)
+        return Fix(frame, t_ns, status, self._stage, n_seen=seen, reason=reason, match=unnamed)
+
+
+def _why(detections: Detections, found: Acquisition) -> str:
+    """The word for a frame that named nothing."""
+    if len(detections) < 3:
+        return "too_few" if len(detections) else "no_lights"
+    return found.reason

@@ -1,0 +1,340 @@
+"""Cold start: which detection is which light, over all layers at once, with what else it could be.
+
+The model: Poisson clutter, a detection probability per light, Gaussian centres, a Gaussian prior on the attitude, a flat
+one on the position inside the view cone. The score of a naming is its log evidence over "all clutter", with the pose
+integrated out by Laplace's method (D. MacKay, "Information Theory, Inference, and Learning Algorithms", ch. 27).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from lumidock._kernels import match as kernel
+from lumidock.camera import Camera
+from lumidock.config import MatchConfig, PriorConfig
+from lumidock.datatypes import Array, Attitude, Detections, Indices
+from lumidock.station import Station
+
+_HEAD_ON = np.diag([1.0, -1.0, -1.0])
+_MIRROR = np.array([1.0, -1.0, 1.0])  # the water's surface is level, and so is dock x, z
+_NONE = -1e300
+_MAX_RELABELLINGS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """A station as the search wants it: M lights, the order in which pairs are tried, and what is unseen before each.
+
+    `survey_m2` (M,) variance of a light's position; `rank` (M,) within its layer; `unseen` (S,) the most lights of a naming without the pairs before.
+    """
+
+    lens: Array
+    p_dock: Array
+    layer: Indices
+    axis: Array
+    survey_m2: Array
+    rank: Indices
+    pairs: Indices
+    unseen: Indices
+    n_layers: int
+    is_rear: Indices
+    log_volume: float
+    sigma_focal: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """Attitude expected: `R_dock_cam` (3, 3), 1/variance (3,) of tilt toward cam x, toward cam y, and of roll, and whether
+    a sensor measured it."""
+
+    R_dock_cam: Array
+    info: Array
+    measured: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """A naming (M,): the detection of each light or -1; the pose that fits it best and its log evidence over clutter."""
+
+    name: Indices
+    T_cam_dock: Array
+    log_evidence: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Acquisition:
+    """The best hypothesis first and what else fits; `margin` is the log odds of its names against all others.
+
+    `flipped` is the other pose of the best names where the plane's flip leaves two. `reason` says why it is no answer.
+    """
+
+    candidates: tuple[Hypothesis, ...]
+    flipped: Hypothesis | None
+    margin: float
+    reason: str = ""
+
+
+def plan(station: Station, camera: Camera, config: MatchConfig) -> Plan:
+    """Prepare a station and a camera for the search."""
+    front_first = station.layers_front_to_rear()
+    behind = np.array([front_first.index(name) for name in station.layers])  # layers in front of each
+    survey_m2 = station.sigma_light_m**2 + (behind > 0)[station.layer] * 2.0 * station.sigma_layer_m**2
+    rank, pairs, unseen = _pair_order(station)
+    size = np.array([camera.width, camera.height]) / camera.focal_px
+    volume = float(size.prod()) * config.far_m**3 / 3.0
+    is_rear = (behind == len(front_first) - 1).astype(np.int64)
+    return Plan(
+        camera.lens(), np.ascontiguousarray(station.p_dock), station.layer, station.axis, survey_m2, rank, pairs, unseen,
+        len(station.layers), is_rear, math.log(volume), station.sigma_focal,
+    )
+
+
+def _pair_order(station: Station) -> tuple[Indices, Indices, Indices]:
+    """Rank (M,) of each light in its layer, well-spread ones first; pairs (S, 2) of one layer; unseen (S,) before each."""
+    orders = [_spread_order(station.p_dock[lights], lights) for lights in map(station.lights_of, station.layers)]
+    done = [0] * len(orders)
+    pairs, unseen = [], []
+
+    def left(layer: int) -> int:
+        """Most lights of a layer that can be named without a pair of those done."""
+        return len(orders[layer]) - max(done[layer], 1) + 1
+
+    while any(k < len(order) for order, k in zip(orders, done, strict=True)):
+        layer = max((n for n in range(len(orders)) if done[n] < len(orders[n])), key=lambda n: (left(n), -n))
+        most = max(map(left, range(len(orders))))
+        k = done[layer]
+        for earlier in range(k):
+            pairs.append((orders[layer][earlier], orders[layer][k]))
+            unseen.append(most)
+        done[layer] += 1
+    rank = np.empty(len(station), np.int64)
+    for order in orders:
+        rank[order] = np.arange(len(order))
+    return rank, np.array(pairs, np.int64).reshape(-1, 2), np.array(unseen, np.int64)
+
+
+def _spread_order(p: Array, lights: Indices) -> list[int]:
+    """Lights in an order that keeps the next one far from those before it."""
+    distance = np.linalg.norm(p[:, None] - p[None], axis=2)
+    order = [int(distance.sum(axis=1).argmax())]
+    while len(order) < len(p):
+        nearest = distance[:, order].min(axis=1)
+        nearest[order] = -1.0
+        order.append(int(nearest.argmax()))
+    return [int(lights[k]) for k in order]
+
+
+def prior(attitude: Attitude | None, config: PriorConfig) -> Prior:
+    """The attitude prior: the vehicle's own where it has one, else the configured one about head-on."""
+    if attitude is not None:
+        return Prior(np.ascontiguousarray(attitude.R_dock_cam), np.full(3, attitude.sigma_rad**-2), True)
+    sigma = np.deg2rad([config.yaw_deg, config.pitch_deg, config.roll_deg])
+    return Prior(_HEAD_ON, sigma**-2, False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spots:
+    """Detections as the kernels want them: `uv`, covariance and variance px^2 of N centres, log likelihood ratios (N, L).
+
+    `log_density` 1/px^2 of spurious spots: geometric in number about `spurious`, a share of them where the detections
+    stand.
+    """
+
+    uv: Array
+    cov: Array
+    var: Array
+    like: Array
+    log_density: float
+
+
+def spots(detections: Detections, plan: Plan, config: MatchConfig) -> Spots:
+    """What the evidence needs to know of a frame's detections; centres without a covariance get the configured one."""
+    uv, n = np.ascontiguousarray(detections.uv), len(detections)
+    cov = np.empty((n, 2, 2))
+    cov[:] = np.eye(2) * config.noise_px**2 if detections.cov_px2 is None else detections.cov_px2
+    var, like = np.empty(n), np.empty((n, plan.n_layers))
+    span = kernel.weigh(uv, cov, detections.p_rear, detections.p_light, plan.is_rear, config.label_trust, like, var)
+    whole, share = plan.lens[6] * plan.lens[7], config.clutter_near
+    box = min(span + config.clutter_margin_px**2, whole) if n else whole
+    density = (1.0 - share) / whole + share / box
+    return Spots(uv, cov, var, like, math.log(density * config.spurious / (1.0 + config.spurious)))
+
+
+def _log_clutter(found: Spots) -> Array:
+    """Log price (N + 1,) of naming 0, 1, .. N detections instead of calling them clutter."""
+    return np.concatenate([[0.0], np.cumsum(found.log_density + np.log(np.arange(len(found.uv), 0, -1)))])
+
+
+def _parameters(plan: Plan, config: MatchConfig, tilt_var: float, roll_sigma: float, *, mixed: bool) -> Array:
+    q = np.empty(10)
+    q[kernel.LOG_VOLUME] = plan.log_volume
+    q[kernel.DETECT], q[kernel.ABSENT] = config.detect, config.layer_absent
+    q[kernel.GATE], q[kernel.NEAR_M], q[kernel.FAR_M] = config.gate, config.near_m, config.far_m
+    q[kernel.ROLL_GATE] = min(config.roll_gate * roll_sigma, math.pi)
+    q[kernel.BEND] = (config.bend * tilt_var) ** 2
+    q[kernel.STEADY], q[kernel.STEADIER] = (config.steady if mixed else 0.0), config.steadier**2
+    return q
+
+
+class _Search:
+    """One frame's arguments to the kernels, for the true array or its mirror image."""
+
+    def __init__(self, plan: Plan, found: Spots, ray: Array, expected: Prior, config: MatchConfig, *, mirrored: bool) -> None:
+        flip = _MIRROR if mirrored else np.ones(3)
+        self.plan, self.found, self.config = plan, found, config
+        offset = (found.uv - plan.lens[3:5]) * (0.5 * plan.sigma_focal)
+        self.var = found.var + (offset**2).sum(axis=1)
+        self.log_clutter, self.ray = _log_clutter(found), ray
+        tilt_var, roll_sigma = float(1.0 / expected.info[:2].min()), float(expected.info[2] ** -0.5)
+        self.q = _parameters(plan, config, tilt_var, roll_sigma, mixed=not expected.measured)
+        self.Rp, self.info = expected.R_dock_cam, expected.info
+        self.p, self.axis = plan.p_dock * flip, plan.axis * flip
+        self.head = (plan.lens, self.p, plan.layer, self.axis, plan.survey_m2)
+
+    def run(self, floor: int, *leasts: int, best: float = _NONE) -> _Listed:
+        """Hypotheses that name at least `floor` lights, by searches that want ever fewer of one layer.
+
+        A later search runs only where the one before left doubt and the spots are few.
+        """
+        plan, found, k, count = self.plan, self.found, self.config.hypotheses, 0
+        names, scores = np.empty((k, len(self.p)), np.int64), np.empty(k)
+        Rs, ts = np.empty((k, 3, 3)), np.empty((k, 3))
+        for least in leasts:
+            count = kernel.search(
+                *self.head, plan.rank, found.uv, self.ray, self.var, found.like, self.log_clutter, self.Rp, self.info,
+                self.q, plan.pairs, plan.unseen, floor, least, best, count, names, scores, Rs, ts,
+            )
+            sure = count > 0 and scores[:count].max() > self.config.sure
+            if sure or len(found.uv) > self.config.max_spots_three:
+                break
+        order = np.argsort(-scores[:count], kind="stable")
+        return _Listed(names[order], scores[order], Rs[order], ts[order])
+
+    def other_pose(self, name: Indices, R: Array, t: Array) -> tuple[float, Array, Array]:
+        R2, t2 = np.empty((3, 3)), np.empty(3)
+        found = self.found
+        score = kernel.other_pose(
+            name, *self.head, found.uv, self.var, found.like, self.log_clutter, R, t, self.Rp, self.info, self.q, R2, t2
+        )
+        return score, R2, t2
+
+    def polish(self, name: Indices, R: Array, t: Array, score: float) -> _Polished:
+        """Follow the best relabelling as long as it is better."""
+        found, m = self.found, len(name)
+        for _ in range(_MAX_RELABELLINGS):
+            without, against, better = np.empty(m), np.empty(m), np.empty(m, np.int64)
+            R2, t2 = np.empty((3, 3)), np.empty(3)
+            best = kernel.rivals(
+                name, light_of(name, len(found.uv)), *self.head, found.uv, self.var, found.like, self.log_clutter, R, t,
+                self.Rp, self.info, self.q, without, against, better, R2, t2,
+            )
+            if best <= score:
+                break
+            name, R, t, score = better, R2, t2, best
+        return _Polished(name, R, t, score, without, against)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Listed:
+    """K hypotheses, best first: the detection `names` (K, M) each light is given, log evidence, and poses."""
+
+    names: Indices
+    scores: Array
+    Rs: Array
+    ts: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Polished:
+    """A naming (M,) that no relabelling betters; log evidence `without` each name, and `against` it."""
+
+    name: Indices
+    R: Array
+    t: Array
+    score: float
+    without: Array
+    against: Array
+
+
+def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: MatchConfig) -> Acquisition:
+    """The most probable naming of one frame's detections, and what it must be held against."""
+    ray = camera.unproject(found.uv)
+    direct = _Search(plan, found, ray, expected, config, mirrored=False)
+    listed = direct.run(3, 4, 3)
+    if not len(listed.scores):
+        return Acquisition((), None, 0.0, "too_few" if len(found.uv) < 3 else "ambiguous")
+    top = direct.polish(listed.names[0], listed.Rs[0], listed.ts[0], float(listed.scores[0]))
+    other, R2, t2 = direct.other_pose(top.name, top.R, top.t)
+    best = float(np.logaddexp(top.score, other))
+    kept = _kept(top, best, listed, _crowding(top.name, found, plan, config), plan, config)
+    conflicting = [s for name, s in zip(listed.names, listed.scores, strict=True) if _conflict(kept, name)]
+    mirror = _mirror_evidence(plan, found, ray, expected, config, top)
+    against = float(np.logaddexp.reduce([-config.log_dock, mirror, *top.against[kept >= 0], *conflicting]))
+    rest = [
+        Hypothesis(name, _pose(R, t), float(s))
+        for name, s, R, t in zip(listed.names, listed.scores, listed.Rs, listed.ts, strict=True)
+        if s > best - config.keep and (name != top.name).any()
+    ]
+    flipped = Hypothesis(kept, _pose(R2, t2), other) if other > top.score - config.keep else None
+    head = Hypothesis(kept, _pose(top.R, top.t), top.score)
+    reason = "mirror" if mirror > best - config.margin else "ambiguous"
+    return Acquisition((head, *rest), flipped, best - against, reason)
+
+
+def _kept(
+    top: _Polished, best: float, listed: _Listed, crowding: float, plan: Plan, config: MatchConfig
+) -> Indices:
+    """The naming (M,) without what is not beyond doubt: single names, and layers with too few of them."""
+    elsewhere = np.where(listed.names != top.name, listed.scores[:, None], _NONE)
+    # most relabellings are in the list as well: counted once
+    doubt = np.logaddexp(top.without + crowding, np.maximum(top.against, np.logaddexp.reduce(elsewhere)))
+    kept = np.where(best - doubt < config.prune, -1, top.name)
+    count = np.bincount(plan.layer[kept >= 0], minlength=plan.n_layers)
+    weak = (count < config.min_layer) & (count < count.max())
+    return np.where(weak[plan.layer], -1, kept)
+
+
+def _crowding(name: Indices, found: Spots, plan: Plan, config: MatchConfig) -> float:
+    """How much denser, as a logarithm >= 0, unnamed spots stand around the named ones than the evidence has it."""
+    used = found.uv[name[name >= 0]]
+    low, high = used.min(axis=0), used.max(axis=0)
+    low, high = low - 0.25 * (high - low), high + 0.25 * (high - low)
+    inside = int(((found.uv >= low) & (found.uv <= high)).all(axis=1).sum()) - len(used)
+    local = (inside + 0.5) / float((high - low).prod() + 1.0)
+    return max(0.0, math.log(local * plan.lens[6] * plan.lens[7] / config.spurious))
+
+
+def _mirror_evidence(
+    plan: Plan, found: Spots, ray: Array, expected: Prior, config: MatchConfig, top: _Polished
+) -> float:
+    """Log evidence, prior included, that the water's surface shows the array: only where it stands above the camera."""
+    named = int((top.name >= 0).sum())
+    listed = _Search(plan, found, ray, expected, config, mirrored=True).run(named, min(named, 4), best=top.score)
+    camera_y = -np.einsum("ki,ki->k", listed.Rs[:, :, 1], listed.ts)
+    return float(np.logaddexp.reduce([_NONE, *listed.scores[camera_y < 0.0]])) + config.log_mirror
+
+
+def _conflict(name: Indices, other: Indices) -> bool:
+    """Whether two namings (M,) differ in a light that both name, or in the light of a detection that both use."""
+    both = (name >= 0) & (other >= 0)
+    if (name[both] != other[both]).any():
+        return True
+    mine = {int(i): c for c, i in enumerate(name) if i >= 0}
+    return any(i >= 0 and mine.get(int(i), c) != c for c, i in enumerate(other))
+
+
+def light_of(name: Indices, n: int) -> Indices:
+    """Light of each of `n` detections from the detection of each light."""
+    light = np.full(n, -1, np.int64)
+    used = np.flatnonzero(name >= 0)
+    light[name[used]] = used
+    return light
+
+
+def _pose(R: Array, t: Array) -> Array:
+    T_cam_dock = np.eye(4)
+    T_cam_dock[:3, :3], T_cam_dock[:3, 3] = R, t
+    return T_cam_dock

@@ -1,0 +1,189 @@
+"""The filter with history: pose, twist, sensor bias, calibration and survey errors in one state, fed with pixels.
+
+A pose alone moves with every frame; calibration and light positions are only considered until lights of two layers
+are seen together, because a plane cannot tell its own errors from the pose's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lumidock._kernels import track as kernel
+from lumidock.config import Config, TrackConfig
+from lumidock.datatypes import Array, Attitude, Indices
+from lumidock.match import Plan, Prior, Spots
+from lumidock.station import Station
+
+_WIDE_M, _WIDE_RAD = 100.0, 3.0  # what is not known of a pose before the first light
+_SOLVE_STEPS, _TRACK_STEPS = 12, 4
+_LEAVES, _SAME_SIGMA = 8, 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """A pose with all that goes with it, at `t_ns`.
+
+    `R`, `t` of T_cam_dock; `x` (n,) twist and slow states, `P` (n, n) their covariance with the pose's (order in
+    `_kernels.track`). `joint`: slow states are being estimated. `log_weight`: log evidence since the track began.
+    `frames` in a row that agreed with it, and `lights_ns`, the last of them. `name` (M,) the detection of each light in
+    that frame, `apart` (M, 18) what leaving one out would do, `nis` the normalised innovation squared of the frame.
+    """
+
+    t_ns: int
+    R: Array
+    t: Array
+    x: Array
+    P: Array
+    joint: bool
+    log_weight: float
+    frames: int
+    lights_ns: int
+    name: Indices
+    apart: Array
+    nis: float
+
+    @property
+    def T_cam_dock(self) -> Array:
+        """Pose (4, 4) of the dock in `cam`."""
+        T_cam_dock = np.eye(4)
+        T_cam_dock[:3, :3], T_cam_dock[:3, 3] = self.R, self.t
+        return T_cam_dock
+
+    @property
+    def n_used(self) -> int:
+        """Lights in the last frame that agreed."""
+        return int((self.name >= 0).sum())
+
+
+def slow_states(station: Station, attitude: Attitude | None) -> tuple[Array, Array]:
+    """Prior values (n,) and covariance (n, n) of everything but the pose; the pose and twist blocks are zero."""
+    attitude_sigma = attitude.sigma_rad if attitude else 0.0
+    m = len(station)
+    n = kernel.LIGHTS + 3 * m
+    P = np.zeros((n, n))
+    P[kernel.BIAS : kernel.CALIBRATION, kernel.BIAS : kernel.CALIBRATION] = np.eye(3) * attitude_sigma**2
+    P[15:18, 15:18] = np.diag([station.sigma_focal**2, station.sigma_center_px**2, station.sigma_center_px**2])
+    together = station.layer[:, None] == station.layer[None, :]
+    per_light = np.eye(m) * station.sigma_light_m**2 + together * station.sigma_layer_m**2
+    P[kernel.LIGHTS :, kernel.LIGHTS :] = np.kron(per_light, np.eye(3))
+    return np.zeros(n), P
+
+
+def start(
+    T_cam_dock: Array,
+    name: Indices,
+    t_ns: int,
+    seen: Spots,
+    plan: Plan,
+    expected: Prior,
+    slow: tuple[Array, Array],
+    config: TrackConfig,
+) -> Track | None:
+    """A track from one frame's names and the pose that fits them; None where they do not hold together.
+
+    `slow` is the prior of the other states, or what an earlier track had learned of them.
+    """
+    x, P = slow[0].copy(), slow[1].copy()
+    P[:3, :3], P[3:6, 3:6] = np.eye(3) * _WIDE_M**2, np.eye(3) * _WIDE_RAD**2
+    P[6:9, 6:9], P[9:12, 9:12] = np.eye(3) * config.start_m_s**2, np.eye(3) * config.start_rad_s**2
+    R0, t0 = T_cam_dock[:3, :3].copy(), T_cam_dock[:3, 3].copy()
+    kernel.attitude_update(R0, t0, x, P, expected.R_dock_cam, 1.0 / expected.info, expected.measured)
+    fresh = Track(t_ns, R0, t0, x, P, False, 0.0, 0, t_ns, name, np.zeros((len(name), 18)), np.nan)
+    return update(fresh, name, seen, plan, config, at=T_cam_dock)
+
+
+def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
+    """The track at a later time, its twist held but for white noise on it."""
+    R, t, P = track.R.copy(), track.t.copy(), track.P.copy()
+    kernel.predict(
+        R, t, track.x[6:12], P, (t_ns - track.t_ns) * 1e-9, config.accel_m_s2**2, config.accel_rad_s2**2
+    )
+    return replace(track, t_ns=t_ns, R=R, t=t, P=P)
+
+
+def attend(track: Track, attitude: Attitude) -> Track:
+    """The track with the vehicle's own attitude taken in."""
+    R, t, x, P = track.R.copy(), track.t.copy(), track.x.copy(), track.P.copy()
+    var = np.full(3, attitude.sigma_rad**2)
+    kernel.attitude_update(R, t, x, P, np.ascontiguousarray(attitude.R_dock_cam), var, True)
+    return replace(track, R=R, t=t, x=x, P=P)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Association:
+    """Names (M,) under a prediction, without the doubtful ones; log evidence over clutter; lights that should show."""
+
+    name: Indices
+    log_evidence: float
+    n_expected: int
+
+
+def associate(track: Track, seen: Spots, plan: Plan, config: Config) -> Association:
+    """Name the detections under the prediction, with backtracking and a missing branch; drop what stays in doubt."""
+    m = len(plan.p_dock)
+    expected, S, shown = np.empty((m, 2)), np.empty((2 * m, 2 * m)), np.empty(m)
+    kernel.look(plan.lens, track.R, track.t, track.x, track.P, plan.p_dock, plan.axis, expected, S, shown)
+    names, costs = np.full((_LEAVES, m), -1, np.int64), np.empty(_LEAVES)
+    found = kernel.associate(
+        expected, S, shown, plan.layer, seen.uv, seen.var, seen.like, seen.log_density, config.match.detect,
+        config.track.gate, config.track.reach, config.track.max_nodes, names, costs,
+    )
+    name, worth = names[0], -costs[:found]
+    if found > 1:  # a name must beat all namings without it
+        others = np.where(names[:found] != name, worth[:, None], -np.inf)
+        doubt = np.logaddexp.reduce(others, axis=0)
+        name = np.where(worth[0] - doubt < config.match.prune, -1, name)
+    return Association(name, float(worth[0]), int((shown == 2.0).sum()))
+
+
+def update(
+    track: Track, name: Indices, seen: Spots, plan: Plan, config: TrackConfig, *, at: Array | None = None
+) -> Track | None:
+    """The track with the named pixels taken in, linearised first at the pose `at`; None where that fails.
+
+    From the first frame on that names `joint_lights` lights of two layers, calibration and light positions move too.
+    """
+    joint = track.joint or _is_joint(name, plan, config)
+    R0, t0, x, P = track.R, track.t, track.x.copy(), track.P.copy()
+    R, t = (track.R.copy(), track.t.copy()) if at is None else (at[:3, :3].copy(), at[:3, 3].copy())
+    apart = np.zeros((len(name), 18))
+    nis, _ = kernel.update(
+        plan.lens, R0, t0, R, t, x, P, plan.p_dock, name, seen.uv, seen.cov,
+        len(P) if joint else kernel.CALIBRATION, _TRACK_STEPS if at is None else _SOLVE_STEPS, apart,
+    )
+    if not np.isfinite(nis):
+        return None
+    return Track(
+        track.t_ns, R, t, x, P, joint, track.log_weight, track.frames + 1, track.t_ns, name, apart, nis
+    )
+
+
+def _is_joint(name: Indices, plan: Plan, config: TrackConfig) -> bool:
+    """Whether at least two layers show enough lights."""
+    count = np.bincount(plan.layer[name >= 0], minlength=plan.n_layers)
+    return int((count >= config.joint_lights).sum()) >= 2
+
+
+def learned(track: Track) -> tuple[Array, Array]:
+    """What a track knows of its slow states, for a new start: their values (n,) and covariance (n, n), no pose."""
+    x, P = track.x.copy(), track.P.copy()
+    x[: kernel.BIAS] = 0.0
+    P[: kernel.BIAS] = 0.0
+    P[:, : kernel.BIAS] = 0.0
+    return x, P
+
+
+def same(a: Track, b: Track) -> bool:
+    """Whether two beliefs are one: the same names, and poses a fraction of a sigma apart."""
+    if (a.name != b.name).any():
+        return False
+    apart = np.concatenate([a.R.T @ (b.t - a.t), 0.5 * _vee(a.R.T @ b.R)])
+    sigma = np.sqrt(np.diagonal(b.P)[:6])
+    return bool((np.abs(apart) < _SAME_SIGMA * sigma + 1e-9).all())
+
+
+def _vee(D: Array) -> Array:
+    """Twice the axis times the sine of a rotation's angle (3,)."""
+    return np.array([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])

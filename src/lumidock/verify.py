@@ -1,0 +1,53 @@
+"""May a match be believed: the innovation test with history, the evidence without."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from lumidock.config import Config, IntegrityConfig, MatchConfig, TrackConfig
+from lumidock.datatypes import Indices
+from lumidock.match import Acquisition
+from lumidock.track import Track
+
+_MIN_LOCK, _MIN_GATHERED = 4, 3
+
+
+def innovation_holds(track: Track, config: TrackConfig) -> bool:
+    """Whether the last frame's innovation is as large as its covariance allows (chi-square in normal approximation)."""
+    dof = 2 * track.n_used
+    return dof > 0 and track.nis <= dof + config.max_nis * math.sqrt(2.0 * dof) + config.max_nis**2 / 2.0
+
+
+def is_answer(found: Acquisition, config: MatchConfig) -> bool:
+    """Whether one frame alone names its lights: four or more of them, and nothing else fits nearly as well."""
+    return bool(found.candidates) and _named(found.candidates[0].name) >= _MIN_LOCK and found.margin > config.margin
+
+
+def gathered(beliefs: list[Track], config: Config) -> bool:
+    """Whether the first of several namings followed over frames has left all others, and clutter, far behind."""
+    first = beliefs[0]
+    if first.frames < 2 or first.n_used < _MIN_GATHERED:
+        return False
+    rivals = [b.log_weight for b in beliefs[1:] if contradict(first.name, b.name)]
+    against = float(np.logaddexp.reduce([-config.match.log_dock, *rivals]))
+    return first.log_weight - against > config.match.margin_gathered
+
+
+def contradict(a: Indices, b: Indices) -> bool:
+    """Whether two namings (M,) give a light two detections, or a detection two lights."""
+    both = (a >= 0) & (b >= 0)
+    if (a[both] != b[both]).any():
+        return True
+    only_a, only_b = a[(a >= 0) & ~both], b[(b >= 0) & ~both]
+    return bool(np.isin(only_a, b).any() or np.isin(only_b, a).any())
+
+
+def is_proven(track: Track, margin: float, config: IntegrityConfig) -> bool:
+    """Whether the names meet the stated risk: by the evidence of one frame, or carried by several in a row."""
+    return margin > config.evidence or track.frames >= config.carried_frames
+
+
+def _named(name: Indices) -> int:
+    return int((name >= 0).sum())

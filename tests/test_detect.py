@@ -1,0 +1,233 @@
+"""The default method's detector and its colour labels, on hand-made and rendered pictures."""
+
+import numpy as np
+import pytest
+from bench.shipped import shipped_camera, shipped_station
+
+from lumidock import detect, layers
+from lumidock.config import DetectConfig, LabelConfig
+from lumidock.datatypes import Attitude, Frame
+from lumidock.sim.scenario import load_scenario, trajectory
+from lumidock.sim.sequence import render_frame
+
+CONFIG = DetectConfig()
+STATION, CAMERA = shipped_station(), shipped_camera()
+
+
+def canvas(rng, size=(240, 320), level=20.0, noise=1.0):
+    return rng.normal(level, noise, size)
+
+
+def add_spot(image, u, v, peak=100.0, sigma=1.5):
+    rows, columns = np.indices(image.shape)
+    image += peak * np.exp(-0.5 * ((columns - u) ** 2 + (rows - v) ** 2) / sigma**2)
+
+
+def add_disc(image, u, v, radius, peak=150.0):
+    """A disc whose edge falls over two pixels."""
+    rows, columns = np.indices(image.shape)
+    image += peak * np.clip(0.5 * (radius + 1.0 - np.hypot(columns - u, rows - v)), 0.0, 1.0)
+
+
+def to_picture(image):
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def found(image, config=CONFIG):
+    image = image if image.dtype == np.uint8 else to_picture(image)
+    return detect.lights(Frame("f", 7, image), config)
+
+
+def in_color(image):
+    """The same picture (H, W, 3) with the largest channel in green."""
+    return np.stack([image // 2, image, image // 3], axis=2).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    """Frames of the approach, by z: picture, lamps and their signal-to-noise ratios."""
+    scenario = load_scenario("approach")
+    poses = trajectory(scenario, np.random.default_rng([3, 0]))[1]
+    pictures = {}
+    for z in (22.0, 14.0, 5.0, -2.0):
+        T_dock_cam = poses[np.argmin(np.abs(poses[:, 2, 3] - z))]
+        rng = np.random.default_rng(3)
+        pictures[z] = render_frame(scenario, STATION, CAMERA, T_dock_cam, np.empty((0, 2)), np.empty(0, int), rng)
+    return pictures
+
+
+def test_finds_the_lights_of_the_approach_and_knows_their_error_and_layer(rendered):
+    nees, false = [], 0
+    for image, seen, snr in rendered.values():
+        frame = Frame("0", 0, image)
+        spots = layers.label(frame, detect.lights(frame, CONFIG), LabelConfig())
+        sure = np.flatnonzero(snr > 20.0)
+        distance = np.linalg.norm(spots.uv[:, None] - seen.uv[None, sure], axis=2)
+        assert (distance.min(axis=0) < 0.5).all()
+        nearest = distance.argmin(axis=0)
+        error = spots.uv[nearest] - seen.uv[sure]
+        nees += np.einsum("ni,nij,nj->n", error, np.linalg.inv(spots.cov_px2[nearest]), error).tolist()
+        assert ((spots.p_rear[nearest] > 0.5) == (sure >= 7)).all()
+        assert (spots.p_light[nearest] > 0.4).all()
+        false += len(spots) - len(set(nearest))
+    assert false <= 3
+    assert 0.5 < np.mean(nees) < 4.0
+
+
+@pytest.mark.parametrize("sigma", [1.0, 1.5, 3.0, 6.0])
+def test_centres_follow_a_spot_through_the_pixel(sigma, rng):
+    errors, nees = [], []
+    for du, dv in rng.uniform(-0.5, 0.5, (12, 2)):
+        image = canvas(rng)
+        add_spot(image, 160 + du, 120 + dv, sigma=sigma)
+        spots = found(image)
+        assert len(spots) == 1
+        errors.append(spots.uv[0] - (160 + du, 120 + dv))
+        nees.append(errors[-1] @ np.linalg.solve(spots.cov_px2[0], errors[-1]))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.06
+    assert np.mean(nees) < 4.0
+
+
+def test_the_covariance_grows_with_the_noise(rng):
+    config = DetectConfig(signal_noise=1e-9, floor_px=1e-9)
+    sigmas = []
+    for noise in (1.0, 4.0):
+        image = canvas(rng, noise=noise)
+        add_spot(image, 160.2, 120.4)
+        sigmas.append(np.sqrt(np.linalg.eigvalsh(found(image, config).cov_px2[0])))
+    assert sigmas[1] / sigmas[0] == pytest.approx([4.0, 4.0], rel=0.15)
+
+
+@pytest.mark.parametrize("radius", [4.0, 10.0, 30.0])
+def test_a_disc_has_its_centre_and_radius(radius, rng):
+    image = canvas(rng, (600, 800))
+    add_disc(image, 400.3, 300.7, radius)
+    spots = found(image)
+    assert len(spots) == 1
+    assert np.linalg.norm(spots.uv[0] - (400.3, 300.7)) < 0.1
+    assert spots.radius_px[0] == pytest.approx(radius, abs=0.5)
+    assert spots.flux[0] == pytest.approx(150.0 * np.pi * radius**2, rel=0.15)
+
+
+@pytest.mark.parametrize("color", [False, True])
+def test_a_saturated_core_with_a_wide_halo_is_one_light(color, rng):
+    image = canvas(rng, (600, 800))
+    add_spot(image, 400.3, 300.7, peak=2000.0, sigma=5.0)
+    add_spot(image, 400.3, 300.7, peak=60.0, sigma=50.0)
+    picture = to_picture(image)
+    spots = found(in_color(picture) if color else picture)
+    assert len(spots) == 1
+    assert np.linalg.norm(spots.uv[0] - (400.3, 300.7)) < 0.15
+    assert spots.p_light[0] > 0.5
+
+
+def test_two_lights_are_two_when_apart_and_one_when_merged(rng):
+    for apart, count in ((24.0, 2), (3.0, 1)):
+        image = canvas(rng)
+        add_spot(image, 150.0, 120.0, sigma=2.5)
+        add_spot(image, 150.0 + apart, 120.0, sigma=2.5)
+        assert len(found(image)) == count
+
+
+def test_a_faint_spot_beside_a_strong_one_is_a_glint(rng):
+    image = canvas(rng)
+    add_spot(image, 150.0, 120.0, peak=200.0, sigma=8.0)
+    add_spot(image, 182.0, 120.0, peak=60.0, sigma=1.5)
+    add_spot(image, 220.0, 120.0, peak=60.0, sigma=1.5)
+    assert sorted(found(image).uv[:, 0].round()) == [150.0, 220.0]
+    assert len(found(image, DetectConfig(glint_radii=0.1))) == 3
+
+
+def test_a_rope_looks_less_like_a_lamp_than_a_disc(rng):
+    image = canvas(rng, (600, 800))
+    add_disc(image, 200.0, 300.0, 8.0)
+    image[270:330, 598:604] += 120.0
+    spots = found(image)
+    is_lamp = np.abs(spots.uv[:, 0] - 200.0) < 2.0
+    assert is_lamp.sum() == 1
+    assert (~is_lamp).any()
+    assert spots.p_light[is_lamp].min() > 2.0 * spots.p_light[~is_lamp].max()
+
+
+@pytest.mark.parametrize("noise", [1.0, 5.0, 30.0])
+def test_noise_alone_gives_hardly_a_spot(noise, rng):
+    assert len(found(canvas(rng, (1024, 1224, 3), 100.0, noise))) <= 2
+
+
+def test_a_gradient_hides_no_light_and_makes_none(rng):
+    image = canvas(rng, (600, 800)) + np.linspace(0, 150, 800)
+    for u in (80.0, 400.0, 720.0):
+        add_spot(image, u, 300.0, peak=60.0)
+    assert sorted(found(image).uv[:, 0].round()) == [80.0, 400.0, 720.0]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 40), (32, 32), (33, 47), (2048, 2448)])
+@pytest.mark.parametrize("channels", [(), (3,)])
+@pytest.mark.parametrize("level", [0, 255])
+def test_flat_frames_of_any_size_give_nothing(size, channels, level):
+    assert len(found(np.full((*size, *channels), level, np.uint8))) == 0
+
+
+def test_a_light_in_the_smallest_frame(rng):
+    image = canvas(rng, (32, 32))
+    add_spot(image, 14.3, 17.6)
+    assert np.linalg.norm(found(image).uv - (14.3, 17.6), axis=1) == pytest.approx([0.0], abs=0.15)
+
+
+def test_lights_at_the_border_are_uncertain(rng):
+    image = canvas(rng)
+    for u, v in ((0.0, 60.0), (319.0, 200.0), (160.0, 0.0), (100.0, 239.0), (0.0, 0.0), (319.0, 239.0), (160.0, 120.0)):
+        add_disc(image, u, v, 6.0)
+    spots = found(image)
+    inside = np.abs(spots.uv - (160.0, 120.0)).max(axis=1) < 5.0
+    assert len(spots) == 7
+    sigma = np.sqrt(spots.cov_px2[:, 0, 0])
+    assert sigma[~inside].min() > 5.0 * sigma[inside].max()
+
+
+def test_colour_and_mono_agree(rng):
+    image = canvas(rng)
+    for u, v in ((50.2, 60.4), (160.0, 120.0), (250.7, 200.1)):
+        add_spot(image, u, v)
+    picture = to_picture(image)
+    mono, color = found(picture), found(in_color(picture))
+    np.testing.assert_array_equal(mono.uv, color.uv)
+    np.testing.assert_array_equal(mono.flux, color.flux)
+    assert np.isnan(layers.label(Frame("f", 7, picture), mono, LabelConfig()).p_rear).all()
+
+
+def test_the_cap_keeps_the_strongest(rng):
+    image = canvas(rng, (400, 400))
+    for k in range(64):
+        add_spot(image, 30.0 + 48.0 * (k % 8), 30.0 + 48.0 * (k // 8), peak=60.0 + 2.0 * k)
+    assert len(found(image)) == 64
+    kept = found(image, DetectConfig(max_spots=10))
+    assert len(kept) == 10
+    assert kept.uv[:, 1].min() > 250.0
+
+
+def test_a_frame_full_of_points_ends_at_the_cap(rng):
+    image = to_picture(255.0 * (rng.random((1024, 1224)) < 0.002))
+    assert len(found(image)) <= CONFIG.max_spots
+
+
+def test_the_same_frame_gives_the_same_bytes(rendered):
+    image = rendered[5.0][0]
+    first, second = found(image), found(image.copy())
+    for name in ("uv", "radius_px", "flux", "p_light", "cov_px2"):
+        assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
+
+
+def test_name_stamp_and_attitude_pass_through(rng):
+    attitude = Attitude(np.eye(3), 0.01)
+    spots = detect.lights(Frame("f", 7, to_picture(canvas(rng)), attitude), CONFIG)
+    assert (spots.frame, spots.t_ns, spots.attitude) == ("f", 7, attitude)
+    assert np.isnan(spots.p_rear).all()
+
+
+def test_colour_without_light_says_nothing(rng):
+    frame = Frame("f", 7, to_picture(canvas(rng, (64, 64, 3))))
+    dark = found(frame.image)
+    spot = type(dark).from_uv("f", 7, np.array([[30.0, 30.0], [0.0, 0.0]]))
+    spot = type(dark)("f", 7, spot.uv, np.array([1.5, 1.5]), np.ones(2), np.ones(2), spot.p_rear)
+    assert np.isnan(layers.label(frame, spot, LabelConfig()).p_rear[0])
