@@ -431,7 +431,7 @@ def wait_for(condition, seconds=60.0):
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc to see the workers")
 def test_a_killed_campaign_goes_on_and_leaves_no_workers(tmp_path):
-    words = [LUMIDOCK, "campaign", "missing-1", "--set", "path.count=40", "--method", "paper", "--seeds", "0:30"]
+    words = [LUMIDOCK, "campaign", "missing-1", "--set", "path.count=20", "--method", "paper", "--seeds", "0:30"]
     process = subprocess.Popen([*words, "--workers", "2", "--out", tmp_path / "out"], stderr=subprocess.PIPE)
     wait_for(lambda: list((tmp_path / "out").glob("shards/*.json")))
     workers = children(process.pid)
@@ -447,7 +447,7 @@ def test_a_killed_campaign_goes_on_and_leaves_no_workers(tmp_path):
     again = subprocess.run([*words, "--out", tmp_path / "out"], capture_output=True, text=True)
     assert "nothing was left to do" in again.stdout
     table = json.loads((tmp_path / "out" / "table.json").read_text())
-    assert table["rows"][0]["counts"]["frames"] == 1200
+    assert table["rows"][0]["counts"]["frames"] == 600
 
 
 def test_an_interrupt_ends_the_campaign_without_a_word(tmp_path):
@@ -455,7 +455,7 @@ def test_an_interrupt_ends_the_campaign_without_a_word(tmp_path):
         "campaign",
         "missing-1",
         "--set",
-        "path.count=40",
+        "path.count=20",
         "--method",
         "paper",
         "--seeds",

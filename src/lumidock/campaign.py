@@ -16,7 +16,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -560,16 +560,18 @@ def _pooled(pool: Executor, shards: list[Shard]) -> Iterator[tuple[Shard, dict[s
     except BrokenProcessPool:
         pass  # those that were given out say so too
     for future in as_completed(futures):
-        error = future.exception()
-        if error is None:
-            yield futures[future], future.result()
-        elif not _worker_died(error):
-            raise error
+        try:
+            result = future.result()
+        except Exception as error:
+            if not _worker_died(error):
+                raise
+        else:
+            yield futures[future], result
 
 
-def _worker_died(error: BaseException) -> bool:
+def _worker_died(error: Exception) -> bool:
     """Whether it was the worker; dask's own error is known by its name, since dask need not be there."""
-    return isinstance(error, BrokenProcessPool) or type(error).__name__ in ("KilledWorker", "CancelledError")
+    return isinstance(error, (BrokenProcessPool, CancelledError)) or type(error).__name__ == "KilledWorker"
 
 
 @contextmanager
@@ -753,6 +755,18 @@ def _nees(row: dict[str, Any]) -> str:
     return ", ".join(cells) or "-"
 
 
+def _level(name: str) -> Callable[[dict[str, Any]], str]:
+    cells = _number("errors", name, "level_median"), _number("errors", name, "level_over_p95", digits=1)
+    return lambda row: f"{cells[0](row)} ({cells[1](row)})"
+
+
+_ERRORS = {
+    "lateral, m": "lateral_m",
+    "axial, m": "axial_m",
+    "angle, deg": "angle_deg",
+    "bearing, deg": "bearing_deg",
+    "range, m": "range_m",
+}
 _SECTIONS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "Answers and names": {
         "runs": _count("runs"),
@@ -763,6 +777,7 @@ _SECTIONS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
         "accepted, %": _percent("accepted", "frames"),
         "with 6+, %": _percent("accepted_full", "frames_full"),
         "with 4-5, %": _percent("accepted_some", "frames_some"),
+        "where owed, %": _percent("accepted_eligible", "frames_eligible"),
         "names": _count("named"),
         "wrong, coincident": _count("wrong_coincident"),
         "wrong, else": _count("wrong_else"),
@@ -770,6 +785,7 @@ _SECTIONS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     },
     "Trust": {
         "valid, %": _percent("valid", "frames"),
+        "valid with 6+, %": _percent("valid_full", "frames_full"),
         "guide, %": _percent("guide", "frames"),
         "guide with 6+, %": _percent("guide_full", "frames_full"),
         "guide with 4-5, %": _percent("guide_some", "frames_some"),
@@ -778,28 +794,8 @@ _SECTIONS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
         **{f"{name} over level": _of(f"over_level_{name}", f"levels_{name}") for name in (*POSE_ERRORS, *GUIDE_ERRORS)},
         "NEES (frames)": _nees,
     },
-    "Errors, median / 95 % / largest": {
-        name: _error(key)
-        for name, key in {
-            "lateral, m": "lateral_m",
-            "axial, m": "axial_m",
-            "angle, deg": "angle_deg",
-            "bearing, deg": "bearing_deg",
-            "range, m": "range_m",
-        }.items()
-    },
-    "Protection levels, median (times the 95 % error)": {
-        name: lambda row, key=key: (  # type: ignore[misc]
-            f"{_number('errors', key, 'level_median')(row)} ({_number('errors', key, 'level_over_p95', digits=1)(row)})"
-        )
-        for name, key in {
-            "lateral, m": "lateral_m",
-            "axial, m": "axial_m",
-            "angle, deg": "angle_deg",
-            "bearing, deg": "bearing_deg",
-            "range, m": "range_m",
-        }.items()
-    },
+    "Errors, median / 95 % / largest": {name: _error(key) for name, key in _ERRORS.items()},
+    "Protection levels, median (times the 95 % error)": {name: _level(key) for name, key in _ERRORS.items()},
     "Over time": {
         "accepted by frame, %": _by_frame("accepted"),
         "guide by frame, %": _by_frame("guide"),

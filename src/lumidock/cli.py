@@ -236,7 +236,7 @@ def _eval(
 
 @app.command("campaign")
 def _campaign(
-    scenarios: Annotated[list[str], typer.Argument(metavar="SCENARIO...", help=f"{_SCENARIOS}, or .yaml files.")],
+    scenarios: Annotated[list[str], typer.Argument(metavar="SCENARIO", help=f"{_SCENARIOS}, or .yaml files.")],
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder to write; the same campaign goes on where it was.")
     ],
@@ -300,7 +300,7 @@ def _demo(
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
-    """Simulate a docking, run it, and leave files and pictures to look at."""
+    """Simulate a docking, run it, and leave files and pictures."""
     from lumidock.demo import Album, summary_lines
     from lumidock.metrics import evaluate, true_poses
     from lumidock.paper import PaperLocalizer

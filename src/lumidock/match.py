@@ -287,14 +287,21 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
 def _kept(
     top: _Polished, best: float, listed: _Listed, crowding: float, plan: Plan, config: MatchConfig
 ) -> Indices:
-    """The naming (M,) without what is not beyond doubt: single names, and layers with too few of them."""
+    """The naming (M,) without what is not beyond doubt: single names, and layers with too few of them.
+
+    Where enough names remain the doubtful ones go; else those that are much likelier than not may stay.
+    """
     elsewhere = np.where(listed.names != top.name, listed.scores[:, None], _NONE)
     # most relabellings are in the list as well: counted once
     doubt = np.logaddexp(top.without + crowding, np.maximum(top.against, np.logaddexp.reduce(elsewhere)))
-    kept = np.where(best - doubt < config.prune, -1, top.name)
-    count = np.bincount(plan.layer[kept >= 0], minlength=plan.n_layers)
-    weak = (count < config.min_layer) & (count < count.max())
-    return np.where(weak[plan.layer], -1, kept)
+    for wanted, enough in ((config.margin + 1.0, config.enough), (config.prune, 0)):
+        kept = np.where(best - doubt < wanted, -1, top.name)
+        count = np.bincount(plan.layer[kept >= 0], minlength=plan.n_layers)
+        weak = (count < config.min_layer) & (count < count.max())
+        kept = np.where(weak[plan.layer], -1, kept)
+        if int((kept >= 0).sum()) >= enough:
+            break
+    return kept
 
 
 def _crowding(name: Indices, found: Spots, plan: Plan, config: MatchConfig) -> float:

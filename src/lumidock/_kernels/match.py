@@ -637,7 +637,7 @@ def search(
                         e = log_evidence(name, lens, p, layer, axis, like, log_clutter, R, t, info, q, cost, log_det, log_var)
                         if e <= -_HUGE or _named(name) < least:
                             continue
-                        if e > best - 10.0:
+                        if e > best - 10.0 or (e > 0.0 and _named(name) > 3):
                             e = _others(
                                 name, taken, lens, p, layer, axis, survey_m2, rank, uv, var, like, log_clutter, R, t, Rp, info, q, work
                             )
