@@ -203,8 +203,8 @@ class MatchConfig(Section):
     margin: PositiveFloat = 6.9  # log odds of the names on one frame, ln 1000
     margin_gathered: PositiveFloat = 9.2  # over frames, or with three lights
     min_layer: PositiveInt = 3  # fewer lights of a second layer stay unnamed without history: they would set the tilt
-    enough: PositiveInt = 5  # names that let the doubtful ones be dropped
-    prune: PositiveFloat = 3.5  # log odds below which a single name is dropped
+    enough: PositiveInt = 4  # names that let the doubtful ones be dropped
+    prune: PositiveFloat = 3.5  # log odds below which a single name is dropped in any case
     keep: PositiveFloat = 14.0  # candidates this far below the best are forgotten
     log_mirror: float = -8.1  # log prior of seeing the mirror image alone
 

@@ -289,19 +289,18 @@ def _kept(
 ) -> Indices:
     """The naming (M,) without what is not beyond doubt: single names, and layers with too few of them.
 
-    Where enough names remain the doubtful ones go; else those that are much likelier than not may stay.
+    The names beyond doubt stay; where they are fewer than `enough`, the likeliest of the others fill up.
     """
     elsewhere = np.where(listed.names != top.name, listed.scores[:, None], _NONE)
     # most relabellings are in the list as well: counted once
     doubt = np.logaddexp(top.without + crowding, np.maximum(top.against, np.logaddexp.reduce(elsewhere)))
-    for wanted, enough in ((config.margin + 1.0, config.enough), (config.prune, 0)):
-        kept = np.where(best - doubt < wanted, -1, top.name)
-        count = np.bincount(plan.layer[kept >= 0], minlength=plan.n_layers)
-        weak = (count < config.min_layer) & (count < count.max())
-        kept = np.where(weak[plan.layer], -1, kept)
-        if int((kept >= 0).sum()) >= enough:
-            break
-    return kept
+    odds = np.where(top.name >= 0, best - doubt, _NONE)
+    likeliest = np.sort(odds)[::-1]
+    least = max(min(config.margin, float(likeliest[min(config.enough, len(odds)) - 1])), config.prune)
+    kept = np.where(odds >= least, top.name, -1)
+    count = np.bincount(plan.layer[kept >= 0], minlength=plan.n_layers)
+    weak = (count < config.min_layer) & (count < count.max())
+    return np.where(weak[plan.layer], -1, kept)
 
 
 def _crowding(name: Indices, found: Spots, plan: Plan, config: MatchConfig) -> float:
