@@ -219,6 +219,7 @@ class TrackConfig(Section):
     gate: PositiveFloat = 18.4  # chi-square, 2 dof, 1e-4
     reach: PositiveFloat = 10.0  # log evidence; namings farther behind the best are not followed
     max_nodes: PositiveInt = 2000  # of the association's search
+    log_appear: float = -6.9  # log prior that a layer comes into view in one frame
     joint_lights: PositiveInt = 3  # of each of two layers, before survey and calibration are estimated
     max_gap_s: PositiveFloat = 2.0  # without lights; after it only survey and calibration are kept
     max_nis: PositiveFloat = 4.0  # sigma of the innovation's chi-square over its mean
@@ -233,7 +234,7 @@ class IntegrityConfig(Section):
     fault: PositiveFloat = 1e-4  # prior probability that a named light is wrong
     separate_from: PositiveInt = 6  # lights for one-fault solution separation
     evidence: PositiveFloat = 13.8  # log odds that stand for the risk, where too few lights can check each other
-    carried_frames: PositiveInt = 5  # frames in a row that stand for it as well
+    carried_frames: PositiveInt = 5  # frames of four lights or more in a row that stand for it as well
     max_age_s: PositiveFloat = 0.3  # of the last light
 
 

@@ -115,8 +115,9 @@ class Localizer:
 
     def _holds(self, belief: Track, seen: Spots) -> bool:
         """Whether a followed belief passes its innovation test and does not leave an array's worth of spots unexplained."""
-        unexplained = len(seen.uv) - belief.n_used
-        return verify.innovation_holds(belief, self.config.track) and (belief.n_used >= 3 or unexplained < 4)
+        unexplained, proven = len(seen.uv) - belief.n_used, belief.proof >= self.config.integrity.carried_frames
+        explains = belief.n_used >= 3 or (proven and unexplained < 4)
+        return explains and verify.innovation_holds(belief, self.config.track)
 
     def _acquire(self, detections: Detections, seen: Spots) -> Acquisition:
         expected = match.prior(detections.attitude, self.config.prior)
@@ -179,7 +180,7 @@ class Localizer:
         """No light fits: a failed test ends trust at once, a dark frame when the last light is too old."""
         nothing = np.full(len(self.station), -1, np.int64)
         self.beliefs = [
-            replace(b, name=nothing, frames=0 if reason == "residual" else b.frames) for b in self.beliefs
+            replace(b, name=nothing, proof=0 if reason == "residual" else b.proof) for b in self.beliefs
         ]
         age_s = (detections.t_ns - self.beliefs[0].lights_ns) * 1e-9
         if reason == "residual" or age_s > self.config.integrity.max_age_s:

@@ -19,27 +19,31 @@ from lumidock.station import Station
 _WIDE_M, _WIDE_RAD = 100.0, 3.0  # what is not known of a pose before the first light
 _SOLVE_STEPS, _TRACK_STEPS = 12, 4
 _LEAVES, _SAME_SIGMA = 8, 0.1
+_NEVER = -(2**62)
+_LAYER_LIGHTS, _PROOF_LIGHTS = 3, 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """A pose with all that goes with it, at `t_ns`.
+    """A pose with all that goes with it, at `t_ns`, since `began_ns`.
 
     `R`, `t` of T_cam_dock; `x` (n,) twist and slow states, `P` (n, n) their covariance with the pose's (order in
     `_kernels.track`). `joint`: slow states are being estimated. `log_weight`: log evidence since the track began.
-    `frames` in a row that agreed with it, and `lights_ns`, the last of them. `name` (M,) the detection of each light in
+    `proof` counts frames that four or more lights agreed in. `name` (M,) the detection of each light in
     that frame, `apart` (M, 18) what leaving one out would do, `nis` the normalised innovation squared of the frame.
     """
 
     t_ns: int
+    began_ns: int
     R: Array
     t: Array
     x: Array
     P: Array
     joint: bool
     log_weight: float
-    frames: int
+    proof: int
     lights_ns: int
+    layer_ns: Indices
     name: Indices
     apart: Array
     nis: float
@@ -90,7 +94,8 @@ def start(
     P[6:9, 6:9], P[9:12, 9:12] = np.eye(3) * config.start_m_s**2, np.eye(3) * config.start_rad_s**2
     R0, t0 = T_cam_dock[:3, :3].copy(), T_cam_dock[:3, 3].copy()
     kernel.attitude_update(R0, t0, x, P, expected.R_dock_cam, 1.0 / expected.info, expected.measured)
-    fresh = Track(t_ns, R0, t0, x, P, False, 0.0, 0, t_ns, name, np.zeros((len(name), 18)), np.nan)
+    never = np.full(plan.n_layers, _NEVER, np.int64)
+    fresh = Track(t_ns, t_ns, R0, t0, x, P, False, 0.0, 0, t_ns, never, name, np.zeros((len(name), 18)), np.nan)
     return update(fresh, name, seen, plan, config, at=T_cam_dock)
 
 
@@ -113,29 +118,46 @@ def attend(track: Track, attitude: Attitude) -> Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Association:
-    """Names (M,) under a prediction, without the doubtful ones; log evidence over clutter; lights that should show."""
+    """Names (M,) under a prediction, without the doubtful ones, and their log evidence over clutter."""
 
     name: Indices
     log_evidence: float
-    n_expected: int
 
 
 def associate(track: Track, seen: Spots, plan: Plan, config: Config) -> Association:
-    """Name the detections under the prediction, with backtracking and a missing branch; drop what stays in doubt."""
+    """Name the detections under the prediction, with backtracking and a missing branch; drop what stays in doubt.
+
+    A layer that was not in view enters with three lights or more, or not at all: where the tilt is open, a stray spot
+    in the wide gate of a single light would set it.
+    """
     m = len(plan.p_dock)
     expected, S, shown = np.empty((m, 2)), np.empty((2 * m, 2 * m)), np.empty(m)
     kernel.look(plan.lens, track.R, track.t, track.x, track.P, plan.p_dock, plan.axis, expected, S, shown)
+    known = (track.t_ns - track.layer_ns <= config.track.max_gap_s * 1e9)[plan.layer]
+    best = _search(expected, S, np.where(known, shown, 0.0), seen, plan, config)
+    if not known.all() and shown[~known].any():
+        wider = _search(expected, S, shown, seen, plan, config)
+        new = np.bincount(plan.layer[(wider.name >= 0) & ~known], minlength=plan.n_layers)
+        enters = (new == 0) | (new >= _LAYER_LIGHTS)
+        if new.any() and enters.all() and wider.log_evidence + config.track.log_appear > best.log_evidence:
+            return wider
+    return best
+
+
+def _search(expected: Array, S: Array, shown: Array, seen: Spots, plan: Plan, config: Config) -> Association:
+    """The best naming, without the names that another one nearly as good does not have."""
+    m = len(shown)
     names, costs = np.full((_LEAVES, m), -1, np.int64), np.empty(_LEAVES)
     found = kernel.associate(
         expected, S, shown, plan.layer, seen.uv, seen.var, seen.like, seen.log_density, config.match.detect,
         config.track.gate, config.track.reach, config.track.max_nodes, names, costs,
     )
     name, worth = names[0], -costs[:found]
-    if found > 1:  # a name must beat all namings without it
+    if found > 1:
         others = np.where(names[:found] != name, worth[:, None], -np.inf)
         doubt = np.logaddexp.reduce(others, axis=0)
         name = np.where(worth[0] - doubt < config.match.prune, -1, name)
-    return Association(name, float(worth[0]), int((shown == 2.0).sum()))
+    return Association(name, float(worth[0]))
 
 
 def update(
@@ -155,8 +177,11 @@ def update(
     )
     if not np.isfinite(nis):
         return None
+    count = np.bincount(plan.layer[name >= 0], minlength=plan.n_layers)
+    layer_ns = np.where((count >= _LAYER_LIGHTS) | (track.layer_ns > _NEVER) & (count > 0), track.t_ns, track.layer_ns)
+    proof = track.proof + int(count.sum() >= _PROOF_LIGHTS)
     return Track(
-        track.t_ns, R, t, x, P, joint, track.log_weight, track.frames + 1, track.t_ns, name, apart, nis
+        track.t_ns, track.began_ns, R, t, x, P, joint, track.log_weight, proof, track.t_ns, layer_ns, name, apart, nis
     )
 
 

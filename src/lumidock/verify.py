@@ -28,7 +28,7 @@ def is_answer(found: Acquisition, config: MatchConfig) -> bool:
 def gathered(beliefs: list[Track], config: Config) -> bool:
     """Whether the first of several namings followed over frames has left all others, and clutter, far behind."""
     first = beliefs[0]
-    if first.frames < 2 or first.n_used < _MIN_GATHERED:
+    if first.t_ns == first.began_ns or first.n_used < _MIN_GATHERED:
         return False
     rivals = [b.log_weight for b in beliefs[1:] if contradict(first.name, b.name)]
     against = float(np.logaddexp.reduce([-config.match.log_dock, *rivals]))
@@ -46,7 +46,7 @@ def contradict(a: Indices, b: Indices) -> bool:
 
 def is_proven(track: Track, margin: float, config: IntegrityConfig) -> bool:
     """Whether the names meet the stated risk: by the evidence of one frame, or carried by several in a row."""
-    return margin > config.evidence or track.frames >= config.carried_frames
+    return margin > config.evidence or track.proof >= config.carried_frames
 
 
 def _named(name: Indices) -> int:
