@@ -22,6 +22,7 @@ _HEAD_ON = np.diag([1.0, -1.0, -1.0])
 _MIRROR = np.array([1.0, -1.0, 1.0])  # the water's surface is level, and so is dock x, z
 _NONE = -1e300
 _MAX_RELABELLINGS = 4
+_FLAT = 0.05  # a layer less thick than this share of its width is a plane
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +42,7 @@ class Plan:
     unseen: Indices
     n_layers: int
     is_rear: Indices
+    planes: Array
     log_volume: float
     sigma_focal: float
 
@@ -88,8 +90,18 @@ def plan(station: Station, camera: Camera, config: MatchConfig) -> Plan:
     is_rear = (behind == len(front_first) - 1).astype(np.int64)
     return Plan(
         camera.lens(), np.ascontiguousarray(station.p_dock), station.layer, station.axis, survey_m2, rank, pairs, unseen,
-        len(station.layers), is_rear, math.log(volume), station.sigma_focal,
+        len(station.layers), is_rear, _planes(station), math.log(volume), station.sigma_focal,
     )
+
+
+def _planes(station: Station) -> Array:
+    """A point and the normal (L, 6) of each layer's plane, NaN for a layer with depth."""
+    planes = np.full((len(station.layers), 6), np.nan)
+    for k, p in enumerate(station.p_dock[station.lights_of(name)] for name in station.layers):
+        _, spread, axes = np.linalg.svd(p - p.mean(axis=0), full_matrices=False)
+        if len(spread) < 3 or spread[2] < _FLAT * spread[0]:
+            planes[k] = *p.mean(axis=0), *np.cross(axes[0], axes[1])
+    return planes
 
 
 def _pair_order(station: Station) -> tuple[Indices, Indices, Indices]:

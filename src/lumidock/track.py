@@ -20,6 +20,7 @@ _WIDE_M, _WIDE_RAD = 100.0, 3.0  # what is not known of a pose before the first 
 _SOLVE_STEPS, _TRACK_STEPS = 12, 4
 _LEAVES, _SAME_SIGMA = 8, 0.1
 _NEVER = -(2**62)
+_NO_PLANE = np.full(6, np.nan)
 _LAYER_LIGHTS, _PROOF_LIGHTS = 3, 4
 
 
@@ -96,7 +97,10 @@ def start(
     kernel.attitude_update(R0, t0, x, P, expected.R_dock_cam, 1.0 / expected.info, expected.measured)
     never = np.full(plan.n_layers, _NEVER, np.int64)
     fresh = Track(t_ns, t_ns, R0, t0, x, P, False, 0.0, 0, t_ns, never, name, np.zeros((len(name), 18)), np.nan)
-    return update(fresh, name, seen, plan, config, at=T_cam_dock)
+    first = update(fresh, name, seen, plan, config, at=T_cam_dock)
+    if first is None or not np.isfinite(_plane(first, name, plan)[0]):
+        return first
+    return update(fresh, name, seen, plan, config, at=first.T_cam_dock, turn_cov=first.P[3:6, 3:6].copy())
 
 
 def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
@@ -161,11 +165,19 @@ def _search(expected: Array, S: Array, shown: Array, seen: Spots, plan: Plan, co
 
 
 def update(
-    track: Track, name: Indices, seen: Spots, plan: Plan, config: TrackConfig, *, at: Array | None = None
+    track: Track,
+    name: Indices,
+    seen: Spots,
+    plan: Plan,
+    config: TrackConfig,
+    *,
+    at: Array | None = None,
+    turn_cov: Array | None = None,
 ) -> Track | None:
     """The track with the named pixels taken in, linearised first at the pose `at`; None where that fails.
 
-    From the first frame on that names `joint_lights` lights of two layers, calibration and light positions move too.
+    A single plane is linearised as flat as `turn_cov` (3, 3), by default the track's own, lets it be. From the first
+    frame on that names `joint_lights` lights of two layers, calibration and light positions move too.
     """
     joint = track.joint or _is_joint(name, plan, config)
     R0, t0, x, P = track.R, track.t, track.x.copy(), track.P.copy()
@@ -173,7 +185,9 @@ def update(
     apart = np.zeros((len(name), 18))
     nis, _ = kernel.update(
         plan.lens, R0, t0, R, t, x, P, plan.p_dock, name, seen.uv, seen.cov,
-        len(P) if joint else kernel.CALIBRATION, _TRACK_STEPS if at is None else _SOLVE_STEPS, apart,
+        len(P) if joint else kernel.CALIBRATION, _TRACK_STEPS if at is None else _SOLVE_STEPS,
+        _NO_PLANE if at is not None and turn_cov is None else _plane(track, name, plan),
+        P[3:6, 3:6].copy() if turn_cov is None else turn_cov, apart,
     )
     if not np.isfinite(nis):
         return None
@@ -183,6 +197,12 @@ def update(
     return Track(
         track.t_ns, track.began_ns, R, t, x, P, joint, track.log_weight, proof, track.t_ns, layer_ns, name, apart, nis
     )
+
+
+def _plane(track: Track, name: Indices, plan: Plan) -> Array:
+    """A point and the normal (6,) of the one plane that all named lights lie on, NaN otherwise or once joint."""
+    layers = np.unique(plan.layer[name >= 0])
+    return plan.planes[layers[0]] if len(layers) == 1 and not track.joint else _NO_PLANE
 
 
 def _is_joint(name: Indices, plan: Plan, config: TrackConfig) -> bool:

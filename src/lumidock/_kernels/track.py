@@ -403,6 +403,37 @@ def _keep(name: Indices, cost: float, names: Indices, costs: Array, found: int) 
 
 
 @njit(cache=True, error_model="numpy")
+def _flatten(R: Array, t: Array, plane: Array, turn_cov: Array, Rf: Array, tf: Array) -> None:
+    """Turn the plane about its point toward the camera, by three sigmas of its tilt at most."""
+    q, n, a = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        q[i] = R[i, 0] * plane[0] + R[i, 1] * plane[1] + R[i, 2] * plane[2] + t[i]
+        n[i] = R[i, 0] * plane[3] + R[i, 1] * plane[4] + R[i, 2] * plane[5]
+    r = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    side = -1.0 if n[0] * q[0] + n[1] * q[1] + n[2] * q[2] > 0.0 else 1.0  # the normal toward the camera
+    for i in range(3):
+        n[i] *= side
+    # the axis that turns the normal onto the line of sight -q / r
+    a[0], a[1], a[2] = n[2] * q[1] - n[1] * q[2], n[0] * q[2] - n[2] * q[0], n[1] * q[0] - n[0] * q[1]
+    sine = math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+    Rf[:], tf[:] = R, t
+    if sine < 1e-9 * r:
+        return
+    a /= sine
+    tilt = math.atan2(sine, -(n[0] * q[0] + n[1] * q[1] + n[2] * q[2]))
+    d, var = np.empty(3), 0.0
+    for i in range(3):
+        d[i] = R[0, i] * a[0] + R[1, i] * a[1] + R[2, i] * a[2]
+    for i in range(3):
+        for j in range(3):
+            var += d[i] * turn_cov[i, j] * d[j]
+    turn = min(tilt, 3.0 * math.sqrt(max(var, 0.0)))
+    rotate_exp(Rf, turn * d[0], turn * d[1], turn * d[2])
+    for i in range(3):
+        tf[i] = q[i] - (Rf[i, 0] * plane[0] + Rf[i, 1] * plane[1] + Rf[i, 2] * plane[2])
+
+
+@njit(cache=True, error_model="numpy")
 def update(
     lens: Array,
     R0: Array,
@@ -417,11 +448,15 @@ def update(
     cov: Array,
     estimated: int,
     steps: int,
+    plane: Array,
+    turn_cov: Array,
     apart: Array,
 ) -> tuple[float, float]:
     """Take in the named pixels, all in one, relinearised up to `steps` times; in place. Returns NIS and rms residual px.
 
-    `R0`, `t0` are the mean that `P` belongs to, `R`, `t` where to linearise first.
+    `R0`, `t0` are the mean that `P` belongs to, `R`, `t` where to linearise first. Where the lights are one `plane` (6,)
+    (a point and the normal; NaN: none), Jacobians are those of the flattest view within three sigmas of tilt by
+    `turn_cov` (3, 3): seen at a slant by mistake, a plane would seem to tell its tilt.
 
     Only the first `estimated` states move; the others are considered: they keep their covariance and lend it to the
     rest (S. F. Schmidt, 1966). `apart` (M, 18) is, for each named light, how far the nine `outputs` would move without
@@ -438,11 +473,19 @@ def update(
     nu, w, dx, before = np.empty(2 * m), np.empty(2 * m), np.zeros(n), np.zeros(6)
     rows, cals, at = np.empty((m, 14)), np.empty((m, 4)), np.empty(3)
     _difference(R0, t0, R, t, dx)
+    flat, Rf, tf = not math.isnan(plane[0]), np.empty((3, 3)), np.empty(3)
     for step in range(steps):
+        if flat:
+            _flatten(R, t, plane, turn_cov, Rf, tf)
         for k in range(m):
             c, i = lights[k], name[lights[k]]
             if not _row(lens, R, t, x, p, c, at, rows[k], cals[k]):
                 return np.nan, np.nan
+            if flat:
+                u, v, cu, cv = rows[k, 0], rows[k, 1], cals[k, 0], cals[k, 1]
+                if not _row(lens, Rf, tf, x, p, c, at, rows[k], cals[k]):
+                    return np.nan, np.nan
+                rows[k, 0], rows[k, 1], cals[k, 0], cals[k, 1] = u, v, cu, cv
             _gains(P, rows[k], cals[k], c, G[2 * k], G[2 * k + 1])
             nu[2 * k] = uv[i, 0] - rows[k, 0] + _dot_row(dx, rows[k], 2, cals[k, 0], CALIBRATION + 1, c)
             nu[2 * k + 1] = uv[i, 1] - rows[k, 1] + _dot_row(dx, rows[k], 8, cals[k, 1], CALIBRATION + 2, c)
