@@ -20,6 +20,7 @@ _WIDE_M, _WIDE_RAD = 100.0, 3.0  # what is not known of a pose before the first 
 _SOLVE_STEPS, _TRACK_STEPS = 12, 4
 _LEAVES, _SAME_SIGMA = 8, 0.1
 _NEVER = -(2**62)
+_FLATTENINGS = 12  # the flatter the view, the wider the tilt it leaves; then it stands
 _NO_PLANE = np.full(6, np.nan)
 _LAYER_LIGHTS, _PROOF_LIGHTS = 3, 4
 
@@ -97,10 +98,16 @@ def start(
     kernel.attitude_update(R0, t0, x, P, expected.R_dock_cam, 1.0 / expected.info, expected.measured)
     never = np.full(plan.n_layers, _NEVER, np.int64)
     fresh = Track(t_ns, t_ns, R0, t0, x, P, False, 0.0, 0, t_ns, never, name, np.zeros((len(name), 18)), np.nan)
-    first = update(fresh, name, seen, plan, config, at=T_cam_dock)
-    if first is None or not np.isfinite(_plane(first, name, plan)[0]):
-        return first
-    return update(fresh, name, seen, plan, config, at=first.T_cam_dock, turn_cov=first.P[3:6, 3:6].copy())
+    begun = update(fresh, name, seen, plan, config, at=T_cam_dock)
+    for _ in range(_FLATTENINGS):
+        if begun is None or not np.isfinite(_plane(begun, name, plan)[0]):
+            break
+        before, begun = begun, update(
+            fresh, name, seen, plan, config, at=begun.T_cam_dock, turn_cov=begun.P[3:6, 3:6].copy()
+        )
+        if begun is not None and np.trace(begun.P[3:6, 3:6]) < 1.02 * np.trace(before.P[3:6, 3:6]):
+            break
+    return begun
 
 
 def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
@@ -187,7 +194,7 @@ def update(
         plan.lens, R0, t0, R, t, x, P, plan.p_dock, name, seen.uv, seen.cov,
         len(P) if joint else kernel.CALIBRATION, _TRACK_STEPS if at is None else _SOLVE_STEPS,
         _NO_PLANE if at is not None and turn_cov is None else _plane(track, name, plan),
-        P[3:6, 3:6].copy() if turn_cov is None else turn_cov, apart,
+        P[3:6, 3:6].copy() if turn_cov is None else turn_cov, at is None, apart,
     )
     if not np.isfinite(nis):
         return None

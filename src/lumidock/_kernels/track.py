@@ -450,13 +450,15 @@ def update(
     steps: int,
     plane: Array,
     turn_cov: Array,
+    tracking: bool,
     apart: Array,
 ) -> tuple[float, float]:
     """Take in the named pixels, all in one, relinearised up to `steps` times; in place. Returns NIS and rms residual px.
 
     `R0`, `t0` are the mean that `P` belongs to, `R`, `t` where to linearise first. Where the lights are one `plane` (6,)
-    (a point and the normal; NaN: none), Jacobians are those of the flattest view within three sigmas of tilt by
-    `turn_cov` (3, 3): seen at a slant by mistake, a plane would seem to tell its tilt.
+    (a point and the normal; NaN: none), the covariance is that of the flattest view within three sigmas of tilt by
+    `turn_cov` (3, 3): seen at a slant by mistake, a plane would seem to tell its tilt. When `tracking` the gain is that
+    of the flattest view as well, so that history rests on perspective and not on the choice between two slants.
 
     Only the first `estimated` states move; the others are considered: they keep their covariance and lend it to the
     rest (S. F. Schmidt, 1966). `apart` (M, 18) is, for each named light, how far the nine `outputs` would move without
@@ -472,47 +474,29 @@ def update(
     G, Z = np.empty((2 * m, n)), np.empty((2 * m, 2 * m))
     nu, w, dx, before = np.empty(2 * m), np.empty(2 * m), np.zeros(n), np.zeros(6)
     rows, cals, at = np.empty((m, 14)), np.empty((m, 4)), np.empty(3)
+    Rf, tf, h, cal = R.copy(), t.copy(), np.empty(14), np.empty(4)
+    plain = math.isnan(plane[0])
     _difference(R0, t0, R, t, dx)
-    flat, Rf, tf = not math.isnan(plane[0]), np.empty((3, 3)), np.empty(3)
     for step in range(steps):
-        if flat:
+        Rf[:], tf[:] = R, t
+        if not plain and tracking:
             _flatten(R, t, plane, turn_cov, Rf, tf)
-        for k in range(m):
-            c, i = lights[k], name[lights[k]]
-            if not _row(lens, R, t, x, p, c, at, rows[k], cals[k]):
-                return np.nan, np.nan
-            if flat:
-                u, v, cu, cv = rows[k, 0], rows[k, 1], cals[k, 0], cals[k, 1]
-                if not _row(lens, Rf, tf, x, p, c, at, rows[k], cals[k]):
-                    return np.nan, np.nan
-                rows[k, 0], rows[k, 1], cals[k, 0], cals[k, 1] = u, v, cu, cv
-            _gains(P, rows[k], cals[k], c, G[2 * k], G[2 * k + 1])
-            nu[2 * k] = uv[i, 0] - rows[k, 0] + _dot_row(dx, rows[k], 2, cals[k, 0], CALIBRATION + 1, c)
-            nu[2 * k + 1] = uv[i, 1] - rows[k, 1] + _dot_row(dx, rows[k], 8, cals[k, 1], CALIBRATION + 2, c)
-        for k in range(m):
-            c = lights[k]
-            for r in range(2 * k, 2 * m):
-                Z[r, 2 * k] = _dot_row(G[r], rows[k], 2, cals[k, 0], CALIBRATION + 1, c)
-                Z[r, 2 * k + 1] = _dot_row(G[r], rows[k], 8, cals[k, 1], CALIBRATION + 2, c)
-            i = name[c]
-            Z[2 * k, 2 * k] += cov[i, 0, 0]
-            Z[2 * k + 1, 2 * k] += cov[i, 1, 0]
-            Z[2 * k + 1, 2 * k + 1] += cov[i, 1, 1]
-        if math.isnan(factor(Z, 2 * m)):
+        if not _whiten(lens, Rf, tf, x, P, p, name, lights, m, cov, rows, cals, G, Z):
             return np.nan, np.nan
-        for r in range(2 * m):  # forward substitution: Y = L^-1 G in place of G, w = L^-1 nu
+        for k in range(m):
+            i = name[lights[k]]
+            if not plain and tracking:
+                if not _row(lens, R, t, x, p, lights[k], at, h, cal):
+                    return np.nan, np.nan
+                rows[k, 0], rows[k, 1] = h[0], h[1]
+            nu[2 * k] = uv[i, 0] - rows[k, 0] + _dot_row(dx, rows[k], 2, cals[k, 0], CALIBRATION + 1, lights[k])
+            nu[2 * k + 1] = uv[i, 1] - rows[k, 1] + _dot_row(dx, rows[k], 8, cals[k, 1], CALIBRATION + 2, lights[k])
+        dx[:] = 0.0
+        for r in range(2 * m):
             s = nu[r]
             for k in range(r):
                 s -= Z[r, k] * w[k]
-                z = Z[r, k]
-                for j in range(n):
-                    G[r, j] -= z * G[k, j]
             w[r] = s / Z[r, r]
-            z = 1.0 / Z[r, r]
-            for j in range(n):
-                G[r, j] *= z
-        dx[:] = 0.0
-        for r in range(2 * m):
             for j in range(estimated):
                 dx[j] += w[r] * G[r, j]
         R[:], t[:], x[:] = R0, t0, x0
@@ -528,14 +512,65 @@ def update(
     nis = 0.0
     for r in range(2 * m):
         nis += w[r] * w[r]
+    Rf[:], tf[:] = R, t
+    if not plain:
+        _flatten(R, t, plane, turn_cov, Rf, tf)
+        if not _whiten(lens, Rf, tf, x, P, p, name, lights, m, cov, rows, cals, G, Z):
+            return np.nan, np.nan
     for r in range(2 * m):
         for i in range(n):
             g = G[r, i]
             end = n if i < estimated else estimated
             for j in range(end):
                 P[i, j] -= g * G[r, j]
-    rms = _separate(lens, R, t, x, P, p, name, lights, m, uv, cov, apart)
+    rms = _separate(lens, R, t, Rf, tf, x, P, p, name, lights, m, uv, cov, apart)
     return nis, rms
+
+
+@njit(cache=True, error_model="numpy")
+def _whiten(
+    lens: Array,
+    R: Array,
+    t: Array,
+    x: Array,
+    P: Array,
+    p: Array,
+    name: Indices,
+    lights: Indices,
+    m: int,
+    cov: Array,
+    rows: Array,
+    cals: Array,
+    G: Array,
+    Z: Array,
+) -> bool:
+    """Jacobian `rows`, `cals` of `m` named lights, the Cholesky factor `Z` of their innovation's covariance, and `G`,
+    L^-1 H P (2 m, n); False where a light is out of the lens's sight.
+    """
+    n, at = len(P), np.empty(3)
+    for k in range(m):
+        if not _row(lens, R, t, x, p, lights[k], at, rows[k], cals[k]):
+            return False
+        _gains(P, rows[k], cals[k], lights[k], G[2 * k], G[2 * k + 1])
+    for k in range(m):
+        c, i = lights[k], name[lights[k]]
+        for r in range(2 * k, 2 * m):
+            Z[r, 2 * k] = _dot_row(G[r], rows[k], 2, cals[k, 0], CALIBRATION + 1, c)
+            Z[r, 2 * k + 1] = _dot_row(G[r], rows[k], 8, cals[k, 1], CALIBRATION + 2, c)
+        Z[2 * k, 2 * k] += cov[i, 0, 0]
+        Z[2 * k + 1, 2 * k] += cov[i, 1, 0]
+        Z[2 * k + 1, 2 * k + 1] += cov[i, 1, 1]
+    if math.isnan(factor(Z, 2 * m)):
+        return False
+    for r in range(2 * m):
+        for k in range(r):
+            z = Z[r, k]
+            for j in range(n):
+                G[r, j] -= z * G[k, j]
+        z = 1.0 / Z[r, r]
+        for j in range(n):
+            G[r, j] *= z
+    return True
 
 
 @njit(cache=True, error_model="numpy")
@@ -543,6 +578,8 @@ def _separate(
     lens: Array,
     R: Array,
     t: Array,
+    Rf: Array,
+    tf: Array,
     x: Array,
     P: Array,
     p: Array,
@@ -555,6 +592,8 @@ def _separate(
 ) -> float:
     """One-fault solution separation from the posterior: what leaving each light out would do. Returns rms residual px.
 
+    Jacobians are those at `Rf`, `tf`, which the covariance was updated with.
+
     Leaving rows H out of a linear estimate moves it by -P H^T (C - H P H^T)^-1 r and adds P H^T (C - H P H^T)^-1 H P.
     """
     n = len(P)
@@ -565,11 +604,12 @@ def _separate(
         c, i = lights[k], name[lights[k]]
         if not _row(lens, R, t, x, p, c, at, h, cal):
             return np.nan
+        ru, rv = uv[i, 0] - h[0], uv[i, 1] - h[1]
+        _row(lens, Rf, tf, x, p, c, at, h, cal)
         _gains(P, h, cal, c, gu, gv)
         a = cov[i, 0, 0] - _dot_row(gu, h, 2, cal[0], CALIBRATION + 1, c)
         b = cov[i, 1, 0] - _dot_row(gv, h, 2, cal[0], CALIBRATION + 1, c)
         d = cov[i, 1, 1] - _dot_row(gv, h, 8, cal[1], CALIBRATION + 2, c)
-        ru, rv = uv[i, 0] - h[0], uv[i, 1] - h[1]
         total += ru * ru + rv * rv
         det = a * d - b * b
         if not (a > 1e-6 * cov[i, 0, 0] and d > 1e-6 * cov[i, 1, 1] and det > 1e-6 * cov[i, 0, 0] * cov[i, 1, 1]):
