@@ -30,6 +30,7 @@ import cv2
 import numpy as np
 
 from lumidock import trust
+from lumidock.bound import Bound
 from lumidock.camera import Camera, load_camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Fix, Indices
@@ -132,7 +133,7 @@ class Tally:
 class Run:
     """One seed of a scenario: N frames and their fixes.
 
-    `eligible` (N,) says in which frames the method owes a lock; None where nobody has worked it out.
+    `eligible` (N,) says in which frames a valid fix is owed; None where nobody has worked it out.
     """
 
     scenario: Scenario
@@ -384,6 +385,7 @@ class Shard:
     station: Station
     camera: Camera
     key: str
+    bound: bool = False
 
     @property
     def file(self) -> str:
@@ -410,7 +412,19 @@ def run_seed(shard: Shard, localizer: _LightDoor, seed: int) -> Run:
         if frame.step == 0:
             localizer.forget()
         fixes.append(localizer.process_detections(frame.detections))
-    return Run(shard.scenario, seed, frames, fixes)
+    return Run(shard.scenario, seed, frames, fixes, _owed(shard, frames) if shard.bound else None)
+
+
+def _owed(shard: Shard, frames: Sequence[SpotFrame]) -> np.ndarray:
+    """In which frames (N,) the bound of what is possible owes a valid fix."""
+    bound = Bound(shard.station, shard.camera, shard.config, cold=shard.cold)
+    owed = np.zeros(len(frames), bool)
+    for k, frame in enumerate(frames):
+        if frame.step == 0:
+            bound.forget()
+        lights = frame.light[frame.light >= 0]
+        owed[k] = bound.owes(frame.detections.t_ns, frame.T_dock_cam, lights)
+    return owed
 
 
 def _localizer(shard: Shard) -> _LightDoor:
@@ -442,11 +456,12 @@ def plan(
     camera_file: Path,
     *,
     cold: bool = False,
+    bound: bool = False,
 ) -> Campaign:
     """Cut scenarios x methods x the seeds from `seeds[0]` to before `seeds[1]` into shards. Raises: InputError."""
     station, camera = load_station(station_file), load_camera(camera_file)
     inputs = {path.name: _digest(path.read_bytes()) for path in (station_file, camera_file)}
-    shared = {"lumidock": f"{version('lumidock')}+{_source_digest()}", "inputs": inputs, "cold": cold}
+    shared = {"lumidock": f"{version('lumidock')}+{_source_digest()}", "inputs": inputs, "cold": cold, "bound": bound}
     shards = []
     for scenario in dict.fromkeys(scenario.model_dump_json() for scenario in scenarios):
         parsed = Scenario.model_validate_json(scenario)
@@ -455,7 +470,7 @@ def plan(
             what = shared | {"scenario": scenario, "config": config.model_dump_json(), "method": method}
             for first, stop in _blocks(seeds):
                 key = _digest(json.dumps(what | {"seeds": [first, stop]}).encode())[:16]
-                shards.append(Shard(parsed, config, method, cold, first, stop, station, camera, key))
+                shards.append(Shard(parsed, config, method, cold, first, stop, station, camera, key, bound))
     identity = shared | {
         "scenarios": [scenario.model_dump(mode="json") for scenario in scenarios],
         "methods": list(methods),
@@ -777,7 +792,6 @@ _SECTIONS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
         "accepted, %": _percent("accepted", "frames"),
         "with 6+, %": _percent("accepted_full", "frames_full"),
         "with 4-5, %": _percent("accepted_some", "frames_some"),
-        "where owed, %": _percent("accepted_eligible", "frames_eligible"),
         "names": _count("named"),
         "wrong, coincident": _count("wrong_coincident"),
         "wrong, else": _count("wrong_else"),
@@ -786,6 +800,7 @@ _SECTIONS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "Trust": {
         "valid, %": _percent("valid", "frames"),
         "valid with 6+, %": _percent("valid_full", "frames_full"),
+        "valid where owed, %": _percent("valid_eligible", "frames_eligible"),
         "guide, %": _percent("guide", "frames"),
         "guide with 6+, %": _percent("guide_full", "frames_full"),
         "guide with 4-5, %": _percent("guide_some", "frames_some"),

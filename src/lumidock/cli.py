@@ -254,6 +254,9 @@ def _campaign(
     cluster: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Run on the dask cluster there: tcp://HOST:PORT.")
     ] = None,
+    bound: Annotated[
+        bool, typer.Option("--bound", help="Also count where the lights in view owe a valid fix (slower).")
+    ] = False,
     station: StationOption = None,
     camera: CameraOption = None,
     force: Force = False,
@@ -273,6 +276,7 @@ def _campaign(
         _shipped_or_path("station", station or _DEFAULT_STATION),
         _shipped_or_path("camera", camera or _DEFAULT_CAMERA),
         cold=cold,
+        bound=bound,
     )
     prepare(campaign, out, force=force)
     with _progress("campaign") as progress:

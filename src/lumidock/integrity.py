@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -83,20 +84,24 @@ def _levels(track: Track, config: IntegrityConfig, cov: Array) -> Array:
     fault_risk = min(config.risk / (config.fault * max(used, 1)), 0.5)
     return np.array(
         kernel.levels(
-            track.R, track.t, track.P, track.apart, _factors(config.risk), _factors(fault_risk),
+            track.R, track.t, track.P, track.apart, sigma_factors(config.risk), sigma_factors(fault_risk),
             used >= config.separate_from, cov,
         )
     )
 
 
-_FACTORS: dict[float, Array] = {}
-
-
-def _factors(risk: float) -> Array:
+@cache
+def sigma_factors(risk: float) -> Array:
     """Sigmas (3,) that the length of a normal vector of 1, 2 and 3 dimensions exceeds with probability `risk`."""
-    if risk not in _FACTORS:
-        _FACTORS[risk] = np.array([_factor(lambda k, n=n: _tail(k, n) - risk) for n in (1, 2, 3)])
-    return _FACTORS[risk]
+    return np.array([_sigma_factor(risk, dimensions) for dimensions in (1, 2, 3)])
+
+
+def _sigma_factor(risk: float, dimensions: int) -> float:
+    low, high = 0.0, 40.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _tail(middle, dimensions) > risk else (low, middle)
+    return high
 
 
 def _tail(k: float, dimensions: int) -> float:
@@ -105,14 +110,6 @@ def _tail(k: float, dimensions: int) -> float:
         return math.exp(-0.5 * k * k)
     one = math.erfc(k / math.sqrt(2.0))
     return one if dimensions == 1 else one + math.sqrt(2.0 / math.pi) * k * math.exp(-0.5 * k * k)
-
-
-def _factor(excess) -> float:  # type: ignore[no-untyped-def]
-    low, high = 0.0, 40.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if excess(middle) > 0.0 else (low, middle)
-    return high
 
 
 def _apart(a: Track, b: Track) -> Array:

@@ -21,7 +21,7 @@ _SOLVE_STEPS, _TRACK_STEPS = 12, 4
 _LEAVES, _SAME_SIGMA = 8, 0.1
 _NEVER = -(2**62)
 _FLATTENINGS = 12  # the flatter the view, the wider the tilt it leaves; then it stands
-_NO_PLANE = np.full(6, np.nan)
+NO_PLANE = np.full(6, np.nan)
 _LAYER_LIGHTS, _PROOF_LIGHTS = 3, 4
 
 
@@ -91,9 +91,7 @@ def start(
 
     `slow` is the prior of the other states, or what an earlier track had learned of them.
     """
-    x, P = slow[0].copy(), slow[1].copy()
-    P[:3, :3], P[3:6, 3:6] = np.eye(3) * _WIDE_M**2, np.eye(3) * _WIDE_RAD**2
-    P[6:9, 6:9], P[9:12, 9:12] = np.eye(3) * config.start_m_s**2, np.eye(3) * config.start_rad_s**2
+    x, P = _open_pose(*slow, config)
     R0, t0 = T_cam_dock[:3, :3].copy(), T_cam_dock[:3, 3].copy()
     kernel.attitude_update(R0, t0, x, P, expected.R_dock_cam, 1.0 / expected.info, expected.measured)
     never = np.full(plan.n_layers, _NEVER, np.int64)
@@ -108,6 +106,19 @@ def start(
         if begun is not None and np.trace(begun.P[3:6, 3:6]) < 1.02 * np.trace(before.P[3:6, 3:6]):
             break
     return begun
+
+
+def _open_pose(x: Array, P: Array, config: TrackConfig) -> tuple[Array, Array]:
+    """Copies of the slow states with a pose and a twist of which nothing is known."""
+    x, P = x.copy(), P.copy()
+    P[:3, :3], P[3:6, 3:6] = np.eye(3) * _WIDE_M**2, np.eye(3) * _WIDE_RAD**2
+    P[6:9, 6:9], P[9:12, 9:12] = np.eye(3) * config.start_m_s**2, np.eye(3) * config.start_rad_s**2
+    return x, P
+
+
+def start_states(station: Station, attitude: Attitude | None, config: TrackConfig) -> tuple[Array, Array]:
+    """Values (n,) and covariance (n, n) of all states before the first light."""
+    return _open_pose(*slow_states(station, attitude), config)
 
 
 def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
@@ -186,14 +197,14 @@ def update(
     A single plane is linearised as flat as `turn_cov` (3, 3), by default the track's own, lets it be. From the first
     frame on that names `joint_lights` lights of two layers, calibration and light positions move too.
     """
-    joint = track.joint or _is_joint(name, plan, config)
+    joint = track.joint or is_joint(name, plan, config)
     R0, t0, x, P = track.R, track.t, track.x.copy(), track.P.copy()
     R, t = (track.R.copy(), track.t.copy()) if at is None else (at[:3, :3].copy(), at[:3, 3].copy())
     apart = np.zeros((len(name), 18))
     nis, _ = kernel.update(
         plan.lens, R0, t0, R, t, x, P, plan.p_dock, name, seen.uv, seen.cov,
         len(P) if joint else kernel.CALIBRATION, _TRACK_STEPS if at is None else _SOLVE_STEPS,
-        _NO_PLANE if at is not None and turn_cov is None else _plane(track, name, plan),
+        NO_PLANE if at is not None and turn_cov is None else _plane(track, name, plan),
         P[3:6, 3:6].copy() if turn_cov is None else turn_cov, at is None, apart,
     )
     if not np.isfinite(nis):
@@ -209,10 +220,10 @@ def update(
 def _plane(track: Track, name: Indices, plan: Plan) -> Array:
     """A point and the normal (6,) of the one plane that all named lights lie on, NaN otherwise or once joint."""
     layers = np.unique(plan.layer[name >= 0])
-    return plan.planes[layers[0]] if len(layers) == 1 and not track.joint else _NO_PLANE
+    return plan.planes[layers[0]] if len(layers) == 1 and not track.joint else NO_PLANE
 
 
-def _is_joint(name: Indices, plan: Plan, config: TrackConfig) -> bool:
+def is_joint(name: Indices, plan: Plan, config: TrackConfig) -> bool:
     """Whether at least two layers show enough lights."""
     count = np.bincount(plan.layer[name >= 0], minlength=plan.n_layers)
     return int((count >= config.joint_lights).sum()) >= 2
