@@ -39,6 +39,7 @@ class Bound:
         self._P: Array | None = None
         self._t_ns = self._lights_ns = 0
         self._joint = False
+        self._known = np.zeros(self._plan.n_layers, bool)
 
     def step(self, t_ns: int, T_dock_cam: Array, lights: Indices) -> Array | None:
         """Lateral m, axial m and angle rad of protection at `t_ns` on the true pose with `lights` (K,) detected."""
@@ -59,7 +60,7 @@ class Bound:
         elif t_ns - self._lights_ns > self.config.integrity.max_age_s * 1e9:
             return None
         nothing = np.zeros((len(self.station), 18))
-        return np.array(kernel.levels(R, t, self._P, nothing, self._factors, self._factors, False, np.empty((9, 9)))[:3])
+        return np.array(kernel.levels(R, t, self._P, nothing, track.NO_PLANE, self._factors, self._factors, False, np.empty((9, 9)))[:3])
 
     def owes(self, t_ns: int, T_dock_cam: Array, lights: Indices) -> bool:
         """Whether a valid fix is owed in this frame: 1.3 times the bound is inside the alert limits."""
@@ -81,8 +82,14 @@ class Bound:
         kernel.predict(R.copy(), t.copy(), np.zeros(6), self._P, dt, config.accel_m_s2**2, config.accel_rad_s2**2)
 
     def _update(self, R: Array, t: Array, T_dock_cam: Array, lights: Indices) -> None:
-        """Exact pixels of the lights: the mean stays where it is, and the covariance shrinks."""
+        """Exact pixels of the lights: the mean stays where it is, and the covariance shrinks.
+
+        A layer counts from the first frame on that shows three lights of it, as in the filter.
+        """
         assert self._P is not None
+        count = np.bincount(self._plan.layer[lights], minlength=self._plan.n_layers)
+        self._known |= (count >= track.LAYER_LIGHTS) | (count == count.max())
+        lights = lights[self._known[self._plan.layer[lights]]]
         name = np.full(len(self.station), -1, np.int64)
         name[lights] = np.arange(len(lights))
         uv = project_lights(self.camera, T_dock_cam, self.station.p_dock[lights])

@@ -222,7 +222,9 @@ class TrackConfig(Section):
     log_appear: float = -6.9  # log prior that a layer comes into view in one frame
     joint_lights: PositiveInt = 3  # of each of two layers, before survey and calibration are estimated
     max_gap_s: PositiveFloat = 2.0  # without lights; after it only survey and calibration are kept
-    max_nis: PositiveFloat = 4.0  # sigma of the innovation's chi-square over its mean
+    max_surprise: PositiveFloat = 4.0  # of one frame's innovation, as a standard normal deviate
+    max_strain: PositiveFloat = 3.5  # of its running mean
+    strain_memory: Fraction = 0.8  # of that mean, a frame
     beliefs: PositiveInt = 6  # poses or namings followed side by side
     forget: PositiveFloat = 16.0  # log odds at which one is given up
 
@@ -231,10 +233,10 @@ class IntegrityConfig(Section):
     """When a pose may be used."""
 
     risk: PositiveFloat = 1e-6  # of a frame
-    fault: PositiveFloat = 1e-4  # prior probability that a named light is wrong
+    fault: PositiveFloat = 1e-5  # prior probability that a named light is wrong; in campaigns of proven tracks 2e-6
     separate_from: PositiveInt = 6  # lights for one-fault solution separation
     evidence: PositiveFloat = 13.8  # log odds that stand for the risk, where too few lights can check each other
-    carried_frames: PositiveInt = 5  # frames of four lights or more in a row that stand for it as well
+    carried_frames: PositiveInt = 2  # frames of four lights or more in a row that stand for it as well
     max_age_s: PositiveFloat = 0.3  # of the last light
 
 

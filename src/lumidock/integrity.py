@@ -84,7 +84,7 @@ def _levels(track: Track, config: IntegrityConfig, cov: Array) -> Array:
     fault_risk = min(config.risk / (config.fault * max(used, 1)), 0.5)
     return np.array(
         kernel.levels(
-            track.R, track.t, track.P, track.apart, sigma_factors(config.risk), sigma_factors(fault_risk),
+            track.R, track.t, track.P, track.apart, track.plane, sigma_factors(config.risk), sigma_factors(fault_risk),
             used >= config.separate_from, cov,
         )
     )

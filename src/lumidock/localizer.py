@@ -15,7 +15,7 @@ from lumidock.match import Acquisition, Hypothesis, Spots
 from lumidock.station import Station
 from lumidock.track import Track
 
-_MAX_LIGHTS, _MAX_SPOTS = 128, 200
+_MIN_LIGHTS, _MIN_SOLID, _MAX_LIGHTS, _MAX_SPOTS = 3, 4, 128, 200
 
 
 class Localizer:
@@ -38,6 +38,7 @@ class Localizer:
         self.beliefs: list[Track] = []
         self.locked = False
         self.margin = 0.0
+        self._failures = 0
         self._stage: Stage = "search"
         self._last: Detections | None = None
         self._slow: tuple[Array, Array] | None = None
@@ -68,10 +69,18 @@ class Localizer:
         """Both doors meet here: warm first, then cold; then what may be said."""
         seen = match.spots(detections, self._plan, self.config.match)
         followed = self._follow(seen)
-        if self.locked and followed and self._holds(followed[0], seen):
+        held = self.locked and bool(followed) and self._holds(followed[0], seen)
+        self._failures = 0 if held else self._failures
+        if held and not self._overlooks(followed[0], seen):
             self.beliefs = followed
             return self._conclude(detections, "tracking")
+        self._failures += 1
+        if self.locked and followed and not held and self._failures == 1:
+            return self._coast(detections, "residual")  # one frame in many thousands fails by chance
         found = self._acquire(detections, seen)
+        if held and not track.is_joint(verify.names_of(found, self.config.match, len(self.station)), self._plan, self.config.track):
+            self.beliefs = followed
+            return self._conclude(detections, "tracking")
         if verify.is_answer(found, self.config.match) and self._lock(found, detections, seen):
             return self._conclude(detections, "acquired")
         if self.locked:
@@ -114,18 +123,30 @@ class Localizer:
         return kept
 
     def _holds(self, belief: Track, seen: Spots) -> bool:
-        """Whether a followed belief passes its innovation test and does not leave an array's worth of spots unexplained."""
-        unexplained, proven = len(seen.uv) - belief.n_used, belief.proof >= self.config.integrity.carried_frames
-        explains = belief.n_used >= 3 or (proven and unexplained < 4)
-        return explains and verify.innovation_holds(belief, self.config.track)
+        """Whether a followed belief passes its innovation test and does not leave an array's worth of spots unexplained.
+
+        Three lights of one plane fit many poses: only a track that has seen two layers lives on less than four.
+        """
+        enough = belief.n_used >= (1 if belief.joint else _MIN_SOLID)
+        unexplained = len(seen.uv) - belief.n_used
+        explains = belief.n_used >= _MIN_LIGHTS or unexplained < _MIN_SOLID
+        return enough and explains and verify.innovation_holds(belief, self.config.track)
+
+    def _overlooks(self, belief: Track, seen: Spots) -> bool:
+        """Whether a second layer may have come into view where the tilt was too open to expect it."""
+        return not belief.joint and self._plan.n_layers > 1 and len(seen.uv) - belief.n_used >= _MIN_SOLID
 
     def _acquire(self, detections: Detections, seen: Spots) -> Acquisition:
         expected = match.prior(detections.attitude, self.config.prior)
         return match.acquire(seen, self._plan, self.camera, expected, self.config.match)
 
     def _start(self, naming: Hypothesis, detections: Detections, seen: Spots) -> Track | None:
-        """A new track from one naming, with what is known of survey and calibration."""
+        """A new track from one naming, with what is known of survey and calibration; None for two names or fewer."""
+        if int((naming.name >= 0).sum()) < _MIN_LIGHTS:
+            return None
         expected = match.prior(detections.attitude, self.config.prior)
+        if self.locked and self.beliefs[0].joint:
+            self._slow = track.learned(self.beliefs[0])
         slow = self._slow or track.slow_states(self.station, detections.attitude)
         begun = track.start(
             naming.T_cam_dock, naming.name, detections.t_ns, seen, self._plan, expected, slow, self.config.track

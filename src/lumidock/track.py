@@ -6,6 +6,7 @@ are seen together, because a plane cannot tell its own errors from the pose's.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +23,7 @@ _LEAVES, _SAME_SIGMA = 8, 0.1
 _NEVER = -(2**62)
 _FLATTENINGS = 12  # the flatter the view, the wider the tilt it leaves; then it stands
 NO_PLANE = np.full(6, np.nan)
-_LAYER_LIGHTS, _PROOF_LIGHTS = 3, 4
+LAYER_LIGHTS, _PROOF_LIGHTS = 3, 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +33,9 @@ class Track:
     `R`, `t` of T_cam_dock; `x` (n,) twist and slow states, `P` (n, n) their covariance with the pose's (order in
     `_kernels.track`). `joint`: slow states are being estimated. `log_weight`: log evidence since the track began.
     `proof` counts frames that four or more lights agreed in. `name` (M,) the detection of each light in
-    that frame, `apart` (M, 18) what leaving one out would do, `nis` the normalised innovation squared of the frame.
+    that frame, `apart` (M, 18) what leaving one out would do, `plane` (6,) the one that all
+    of them lie on (NaN: none), `nis` its normalised innovation squared, `surprise` the
+    same as a standard normal deviate, and `strain` the running mean of that over frames, as a deviate too.
     """
 
     t_ns: int
@@ -48,7 +51,10 @@ class Track:
     layer_ns: Indices
     name: Indices
     apart: Array
+    plane: Array
     nis: float
+    surprise: float
+    strain: float
 
     @property
     def T_cam_dock(self) -> Array:
@@ -95,10 +101,10 @@ def start(
     R0, t0 = T_cam_dock[:3, :3].copy(), T_cam_dock[:3, 3].copy()
     kernel.attitude_update(R0, t0, x, P, expected.R_dock_cam, 1.0 / expected.info, expected.measured)
     never = np.full(plan.n_layers, _NEVER, np.int64)
-    fresh = Track(t_ns, t_ns, R0, t0, x, P, False, 0.0, 0, t_ns, never, name, np.zeros((len(name), 18)), np.nan)
+    fresh = Track(t_ns, t_ns, R0, t0, x, P, False, 0.0, 0, t_ns, never, name, np.zeros((len(name), 18)), NO_PLANE, np.nan, 0.0, 0.0)
     begun = update(fresh, name, seen, plan, config, at=T_cam_dock)
     for _ in range(_FLATTENINGS):
-        if begun is None or not np.isfinite(_plane(begun, name, plan)[0]):
+        if begun is None or not np.isfinite(begun.plane[0]):
             break
         before, begun = begun, update(
             fresh, name, seen, plan, config, at=begun.T_cam_dock, turn_cov=begun.P[3:6, 3:6].copy()
@@ -160,7 +166,7 @@ def associate(track: Track, seen: Spots, plan: Plan, config: Config) -> Associat
     if not known.all() and shown[~known].any():
         wider = _search(expected, S, shown, seen, plan, config)
         new = np.bincount(plan.layer[(wider.name >= 0) & ~known], minlength=plan.n_layers)
-        enters = (new == 0) | (new >= _LAYER_LIGHTS)
+        enters = (new == 0) | (new >= LAYER_LIGHTS)
         if new.any() and enters.all() and wider.log_evidence + config.track.log_appear > best.log_evidence:
             return wider
     return best
@@ -200,27 +206,39 @@ def update(
     joint = track.joint or is_joint(name, plan, config)
     R0, t0, x, P = track.R, track.t, track.x.copy(), track.P.copy()
     R, t = (track.R.copy(), track.t.copy()) if at is None else (at[:3, :3].copy(), at[:3, 3].copy())
-    apart = np.zeros((len(name), 18))
+    apart, plane = np.zeros((len(name), 18)), _plane(name, plan, joint=track.joint)
     nis, _ = kernel.update(
         plan.lens, R0, t0, R, t, x, P, plan.p_dock, name, seen.uv, seen.cov,
         len(P) if joint else kernel.CALIBRATION, _TRACK_STEPS if at is None else _SOLVE_STEPS,
-        NO_PLANE if at is not None and turn_cov is None else _plane(track, name, plan),
+        NO_PLANE if at is not None and turn_cov is None else plane,
         P[3:6, 3:6].copy() if turn_cov is None else turn_cov, at is None, apart,
     )
     if not np.isfinite(nis):
         return None
     count = np.bincount(plan.layer[name >= 0], minlength=plan.n_layers)
-    layer_ns = np.where((count >= _LAYER_LIGHTS) | (track.layer_ns > _NEVER) & (count > 0), track.t_ns, track.layer_ns)
+    layer_ns = np.where((count >= LAYER_LIGHTS) | (track.layer_ns > _NEVER) & (count > 0), track.t_ns, track.layer_ns)
+    surprise = _deviate(nis, 2 * int(count.sum()))
     proof = track.proof + int(count.sum() >= _PROOF_LIGHTS)
     return Track(
-        track.t_ns, track.began_ns, R, t, x, P, joint, track.log_weight, proof, track.t_ns, layer_ns, name, apart, nis
+        track.t_ns, track.began_ns, R, t, x, P, joint, track.log_weight, proof, track.t_ns, layer_ns, name, apart, plane, nis,
+        surprise, config.strain_memory * track.strain + math.sqrt(1.0 - config.strain_memory**2) * surprise,
     )
 
 
-def _plane(track: Track, name: Indices, plan: Plan) -> Array:
-    """A point and the normal (6,) of the one plane that all named lights lie on, NaN otherwise or once joint."""
-    layers = np.unique(plan.layer[name >= 0])
-    return plan.planes[layers[0]] if len(layers) == 1 and not track.joint else NO_PLANE
+def _deviate(square: float, dof: int) -> float:
+    """A chi-square value as a standard normal deviate. Source: E. Wilson, M. Hilferty, 1931."""
+    spread = 2.0 / (9.0 * dof)
+    return ((square / dof) ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(spread)
+
+
+def _plane(name: Indices, plan: Plan, *, joint: bool) -> Array:
+    """A point and the normal (6,) of the plane that all named lights lie on, NaN where its slant is no question.
+
+    It is none with two layers in view, and with four lights or more of a track that has seen two.
+    """
+    named = plan.layer[name >= 0]
+    alone = 0 < len(named) < (_PROOF_LIGHTS if joint else len(name) + 1) and (named == named[0]).all()
+    return plan.planes[named[0]] if alone else NO_PLANE
 
 
 def is_joint(name: Indices, plan: Plan, config: TrackConfig) -> bool:

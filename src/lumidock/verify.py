@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from lumidock.config import Config, IntegrityConfig, MatchConfig, TrackConfig
@@ -15,14 +13,18 @@ _MIN_LOCK, _MIN_GATHERED = 4, 3
 
 
 def innovation_holds(track: Track, config: TrackConfig) -> bool:
-    """Whether the last frame's innovation is as large as its covariance allows (chi-square in normal approximation)."""
-    dof = 2 * track.n_used
-    return dof > 0 and track.nis <= dof + config.max_nis * math.sqrt(2.0 * dof) + config.max_nis**2 / 2.0
+    """Whether the last frame's innovation, and that of the frames before, is as large as its covariance allows."""
+    return track.n_used > 0 and track.surprise < config.max_surprise and track.strain < config.max_strain
 
 
 def is_answer(found: Acquisition, config: MatchConfig) -> bool:
     """Whether one frame alone names its lights: four or more of them, and nothing else fits nearly as well."""
     return bool(found.candidates) and _named(found.candidates[0].name) >= _MIN_LOCK and found.margin > config.margin
+
+
+def names_of(found: Acquisition, config: MatchConfig, lights: int) -> Indices:
+    """The names (M,) of an answer, none where there is no answer."""
+    return found.candidates[0].name if is_answer(found, config) else np.full(lights, -1, np.int64)
 
 
 def gathered(beliefs: list[Track], config: Config) -> bool:

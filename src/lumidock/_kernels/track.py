@@ -21,6 +21,7 @@ TWIST, BIAS, CALIBRATION, LIGHTS = 6, 12, 15, 18
 _LOG_2PI = math.log(2.0 * math.pi)
 _LEAVES = 8
 _MARGIN_PX, _SHINES = 3.0, 0.1
+_TILT_SIGMAS = 2.5  # of a plane's tilt, for what its square does to the range
 
 
 @njit(cache=True, error_model="numpy")
@@ -403,31 +404,40 @@ def _keep(name: Indices, cost: float, names: Indices, costs: Array, found: int) 
 
 
 @njit(cache=True, error_model="numpy")
-def _flatten(R: Array, t: Array, plane: Array, turn_cov: Array, Rf: Array, tf: Array) -> None:
-    """Turn the plane about its point toward the camera, by three sigmas of its tilt at most."""
-    q, n, a = np.empty(3), np.empty(3), np.empty(3)
+def _tilt(R: Array, t: Array, plane: Array, turn_cov: Array, q: Array, axis: Array) -> tuple[float, float]:
+    """Angle rad between a plane's normal and the line of sight to its point, and its sigma.
+
+    Fills the point `q` (3,) in `cam` and the `axis` (3,) in `dock` that turns the normal onto the line of sight.
+    """
+    n, a = np.empty(3), np.empty(3)
     for i in range(3):
         q[i] = R[i, 0] * plane[0] + R[i, 1] * plane[1] + R[i, 2] * plane[2] + t[i]
         n[i] = R[i, 0] * plane[3] + R[i, 1] * plane[4] + R[i, 2] * plane[5]
     r = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
-    side = -1.0 if n[0] * q[0] + n[1] * q[1] + n[2] * q[2] > 0.0 else 1.0  # the normal toward the camera
-    for i in range(3):
-        n[i] *= side
-    # the axis that turns the normal onto the line of sight -q / r
+    if n[0] * q[0] + n[1] * q[1] + n[2] * q[2] > 0.0:  # the normal toward the camera
+        n *= -1.0
     a[0], a[1], a[2] = n[2] * q[1] - n[1] * q[2], n[0] * q[2] - n[2] * q[0], n[1] * q[0] - n[0] * q[1]
     sine = math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
-    Rf[:], tf[:] = R, t
     if sine < 1e-9 * r:
-        return
-    a /= sine
-    tilt = math.atan2(sine, -(n[0] * q[0] + n[1] * q[1] + n[2] * q[2]))
-    d, var = np.empty(3), 0.0
+        a[0], a[1], a[2], sine = R[0, 0], R[1, 0], R[2, 0], 1e-12
+    else:
+        a /= sine
+    tilt, var = math.atan2(sine, -(n[0] * q[0] + n[1] * q[1] + n[2] * q[2])), 0.0
     for i in range(3):
-        d[i] = R[0, i] * a[0] + R[1, i] * a[1] + R[2, i] * a[2]
+        axis[i] = R[0, i] * a[0] + R[1, i] * a[1] + R[2, i] * a[2]
     for i in range(3):
         for j in range(3):
-            var += d[i] * turn_cov[i, j] * d[j]
-    turn = min(tilt, 3.0 * math.sqrt(max(var, 0.0)))
+            var += axis[i] * turn_cov[i, j] * axis[j]
+    return tilt, math.sqrt(max(var, 0.0))
+
+
+@njit(cache=True, error_model="numpy")
+def _flatten(R: Array, t: Array, plane: Array, turn_cov: Array, Rf: Array, tf: Array) -> None:
+    """Turn the plane about its point toward the camera, by three sigmas of its tilt at most."""
+    q, d = np.empty(3), np.empty(3)
+    tilt, sigma = _tilt(R, t, plane, turn_cov, q, d)
+    turn = min(tilt, 3.0 * sigma)
+    Rf[:] = R
     rotate_exp(Rf, turn * d[0], turn * d[1], turn * d[2])
     for i in range(3):
         tf[i] = q[i] - (Rf[i, 0] * plane[0] + Rf[i, 1] * plane[1] + Rf[i, 2] * plane[2])
@@ -671,12 +681,21 @@ def _largest3(A: Array) -> float:
 
 @njit(cache=True, error_model="numpy")
 def levels(
-    R: Array, t: Array, P: Array, apart: Array, k_free: Array, k_fault: Array, separate: bool, cov: Array
+    R: Array,
+    t: Array,
+    P: Array,
+    apart: Array,
+    plane: Array,
+    k_free: Array,
+    k_fault: Array,
+    separate: bool,
+    cov: Array,
 ) -> tuple[float, float, float, float, float]:
     """Protection levels: lateral m, axial m, angle rad, bearing rad, range m; `cov` (9, 9) of `outputs` is filled.
 
     `k_free` and `k_fault` (3,) are the factors on sigma in one, two and three dimensions without a fault and with one
-    light at fault; with `separate` every light of `apart` may be.
+    light at fault; with `separate` every light of `apart` may be. A tilted `plane` looks smaller by its square: range
+    and axial levels have room for what the tilt's spread can do to them.
     """
     C = outputs(R, t)
     for i in range(9):
@@ -701,4 +720,10 @@ def levels(
             pl2 = max(pl2, turn + k_fault[2] * math.sqrt(angle + a[12] + a[13] + a[14]))
             pl3 = max(pl3, math.hypot(a[6], a[7]) + k_fault[1] * math.sqrt(bearing + a[15] + a[16]))
             pl4 = max(pl4, abs(a[8]) + k_fault[0] * math.sqrt(distance + a[17]))
+    if not math.isnan(plane[0]):
+        q, axis = np.empty(3), np.empty(3)
+        tilt, sigma = _tilt(R, t, plane, P[3:6, 3:6], q, axis)
+        far = tilt + _TILT_SIGMAS * sigma
+        shrunk = 0.25 * (far * far - tilt * tilt) * math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+        pl1, pl4 = pl1 + shrunk, pl4 + shrunk
     return pl0, pl1, pl2, pl3, pl4
