@@ -39,12 +39,14 @@ class Camera:
     K: Array
     model: DistortionModel = "plumb_bob"
     distortion: Array = field(default_factory=lambda: np.zeros(5))
+    _pinhole: bool = field(init=False)
     _fold: float = field(init=False)  # where the lens model ends: normalised radius, or angle in rad
 
     def __post_init__(self) -> None:
         require_shape("K", self.K, 3, 3)
         if len(self.distortion) not in _COEFFICIENTS[self.model]:
             raise ValueError(f"{self.model} takes {_COEFFICIENTS[self.model]} coefficients")
+        object.__setattr__(self, "_pinhole", self.model != "equidistant" and not np.any(self.distortion))
         object.__setattr__(self, "_fold", _fold_of(self.model, self.distortion))
 
     @property
@@ -94,6 +96,9 @@ class Camera:
     def unproject(self, uv: Array) -> Array:
         """Unit rays `ray_cam` (N, 3) of pixels `uv` (N, 2); NaN where no ray reaches the pixel."""
         xy = (uv - self.center_px) / self.focal_px
+        if self._pinhole:
+            ray = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+            return np.asarray(ray / np.sqrt((ray * ray).sum(axis=1, keepdims=True)))
         if self.model == "equidistant":
             return _undistort_equidistant(xy, self.distortion, self._fold)
         return _undistort_rational(xy, self.distortion, self._fold)

@@ -292,6 +292,39 @@ def grow(
 
 
 @njit(cache=True, error_model="numpy")
+def _reachable(
+    allowed: int,
+    name: Indices,
+    taken: Indices,
+    lens: Array,
+    p: Array,
+    layer: Indices,
+    survey_m2: Array,
+    uv: Array,
+    R: Array,
+    t: Array,
+    P: Array,
+    q: Array,
+) -> int:
+    """How many unnamed lights of one layer have a detection within the reach of their gate."""
+    h, S = np.empty(14), np.empty(3)
+    mu, mv = _mean_named(name, uv)
+    count = 0
+    for c in range(len(name)):
+        if name[c] >= 0 or layer[c] != allowed or not light_row(lens, R, t, p[c], h):
+            continue
+        extra = 1.0 + _survey_var(lens, R, t, p[c], survey_m2[c]) + q[BEND] * ((h[0] - mu) ** 2 + (h[1] - mv) ** 2)
+        _innovation(h, P, extra, S)
+        det = q[GATE] * (S[0] * S[2] - S[1] * S[1])
+        for i in range(len(uv)):
+            du, dv = uv[i, 0] - h[0], uv[i, 1] - h[1]
+            if taken[i] < 0 and S[2] * du * du - 2.0 * S[1] * du * dv + S[0] * dv * dv < det:
+                count += 1
+                break
+    return count
+
+
+@njit(cache=True, error_model="numpy")
 def _pair_pose(
     d: Array, ray_i: Array, ray_j: Array, q: Array, out: Array
 ) -> int:
@@ -568,7 +601,7 @@ def search(
 
     `pairs` (S, 2) are lights of one layer, in order; `unseen` (S,) is the most lights of one layer that a hypothesis
     can name without naming any pair before that one. The search stops when what it has not seen cannot come within one
-    light of the best, so that it is exhaustive in what matters. `floor` is that bound at the start; `least` how many lights of
+    light of the best, nor within two in any one layer, so that it is exhaustive in what matters. `floor` is that bound at the start; `least` how many lights of
     one layer a hypothesis must name, `best` a log evidence to measure up to. A third light comes after both of a pair
     in `rank` (M,), so that each triple is tried once.
     """
@@ -581,10 +614,11 @@ def search(
     R0, t0, R, t, d = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3)
     g = np.empty(6)
     most, layers = floor, like.shape[1]
+    in_layer = floor - 1 if floor > least else 0  # lights of one layer that a hypothesis must name at least
     for k in range(count):
         best = max(best, scores[k])
     for s in range(len(pairs)):
-        wanted = max(least, (max(most, floor) + layers - 1) // layers)
+        wanted = max(least, in_layer, (max(most, floor) + layers - 1) // layers)
         if unseen[s] < wanted:
             break
         a, b = pairs[s, 0], pairs[s, 1]
@@ -617,6 +651,11 @@ def search(
                         layer[a], name, taken, lens, p, layer, survey_m2, uv, var, like, R0, t0, P, q[GATE], q[BEND],
                         max(rank[a], rank[b]), rank, thirds,
                     )
+                    wanted = max(least, in_layer, (max(most, floor) + layers - 1) // layers)
+                    if wanted > 3 and _reachable(layer[a], name, taken, lens, p, layer, survey_m2, uv, R0, t0, P, q) < (
+                        wanted - 2
+                    ):
+                        continue
                     for k in range(found):
                         c, o = int(thirds[k, 1]), int(thirds[k, 2])
                         name[:] = -1
@@ -624,7 +663,7 @@ def search(
                         name[a], name[b], taken[i], taken[j] = i, j, a, b
                         if _contains(names, count, a, i, c, o) and _contains(names, count, b, j, c, o):
                             continue
-                        wanted = max(least, (max(most, floor) + layers - 1) // layers)
+                        wanted = max(least, in_layer, (max(most, floor) + layers - 1) // layers)
                         if wanted > 3 and wanted > 3 + _support(
                             c, o, name, taken, lens, p, layer, survey_m2, uv, var, R0, t0, P, q[GATE], q[BEND]
                         ):
@@ -648,6 +687,7 @@ def search(
                             best = e
                             if e > 0.0:
                                 most = max(most, _named(name) - 1)
+                                in_layer = max(in_layer, _most_in_layer(name, layer, layers) - 2)
     for k in range(count):
         scores[k] = evidence(
             names[k], lens, p, layer, axis, survey_m2, uv, var, like, log_clutter, Rs[k], ts[k], Rp, info, q, 6, H, L
@@ -665,6 +705,15 @@ def _pose_of(Rp: Array, roll: float, z: float, ray: Array, p: Array, R: Array, t
         R[2, k] = Rp[k, 2]
     for k in range(3):
         t[k] = z * ray[k] / ray[2] - (R[k, 0] * p[0] + R[k, 1] * p[1] + R[k, 2] * p[2])
+
+
+@njit(cache=True, error_model="numpy")
+def _most_in_layer(name: Indices, layer: Indices, layers: int) -> int:
+    count = np.zeros(layers, np.int64)
+    for c in range(len(name)):
+        if name[c] >= 0:
+            count[layer[c]] += 1
+    return count.max()
 
 
 @njit(cache=True, error_model="numpy")
