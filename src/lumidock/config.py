@@ -196,7 +196,7 @@ class MatchConfig(Section):
     roll_gate: PositiveFloat = 3.3  # sigma of the prior
     near_m: PositiveFloat = 0.3
     far_m: PositiveFloat = 40.0  # of a light
-    hypotheses: PositiveInt = 24
+    hypotheses: PositiveInt = 64
     log_dock: float = 2.0  # log prior odds that the dock is in view at all
     max_spots_three: PositiveInt = 14  # among more, three lights of a layer say nothing
     sure: PositiveFloat = 15.0  # log evidence above which three lights of each layer need not be looked for
@@ -204,6 +204,7 @@ class MatchConfig(Section):
     margin_gathered: PositiveFloat = 9.2  # over frames, or with three lights
     min_layer: PositiveInt = 3  # fewer lights of a second layer stay unnamed without history: they would set the tilt
     enough: PositiveInt = 4  # names that let the doubtful ones be dropped
+    extra: PositiveFloat = 10.0  # log odds of a name that a lock does not need
     prune: PositiveFloat = 3.5  # log odds below which a single name is dropped in any case
     keep: PositiveFloat = 14.0  # candidates this far below the best are forgotten
     log_mirror: float = -8.1  # log prior of seeing the mirror image alone
@@ -225,7 +226,7 @@ class TrackConfig(Section):
     max_surprise: PositiveFloat = 4.0  # of one frame's innovation, as a standard normal deviate
     max_strain: PositiveFloat = 3.5  # of its running mean
     strain_memory: Fraction = 0.8  # of that mean, a frame
-    beliefs: PositiveInt = 6  # poses or namings followed side by side
+    beliefs: PositiveInt = 32  # poses or namings followed side by side
     forget: PositiveFloat = 16.0  # log odds at which one is given up
 
 

@@ -15,7 +15,7 @@ from lumidock.match import Acquisition, Hypothesis, Spots
 from lumidock.station import Station
 from lumidock.track import Track
 
-_MIN_LIGHTS, _MIN_SOLID, _MAX_LIGHTS, _MAX_SPOTS = 3, 4, 128, 200
+_MIN_LIGHTS, _MIN_SOLID, _MAX_LIGHTS, _MAX_SPOTS, _MAX_RIVALS = 3, 4, 128, 200, 8
 
 
 class Localizer:
@@ -157,7 +157,7 @@ class Localizer:
         """Believe an answer, its flip and, with history, what contradicts it and is not yet out of the question."""
         head = found.candidates[0]
         rivals = [c for c in found.candidates[1:] if verify.contradict(c.name, head.name)]
-        namings = [head, *([found.flipped] if found.flipped else []), *([] if self.cold else rivals[:2])]
+        namings = [head, *([found.flipped] if found.flipped else []), *([] if self.cold else rivals[:_MAX_RIVALS])]
         begun = [self._start(naming, detections, seen) for naming in namings]
         if begun[0] is None or not verify.innovation_holds(begun[0], self.config.track):
             return False
@@ -166,14 +166,35 @@ class Localizer:
         return True
 
     def _gather(self, followed: list[Track], found: Acquisition, detections: Detections, seen: Spots) -> bool:
-        """Follow every naming that one frame leaves open until one stands out."""
+        """Follow every naming that one frame leaves open until one stands out, in this frame too.
+
+        A naming that this frame gives again starts anew from its pose now, with the weight that it has gathered.
+        """
         new = [*found.candidates, *([found.flipped] if found.flipped else [])][: self.config.track.beliefs]
-        begun = [self._start(n, detections, seen) for n in new if not any((n.name == b.name).all() for b in followed)]
-        self.beliefs = self._likeliest([*followed, *(belief for belief in begun if belief is not None)])
-        if found.reason == "mirror" or not self.beliefs or not verify.gathered(self.beliefs, self.config):
+        begun = [self._renew(naming, new, followed, detections, seen) for naming in new]
+        others = [b for b in followed if not any((b.name == naming.name).all() for naming in new)]
+        self.beliefs = self._likeliest([*others, *(belief for belief in begun if belief is not None)])
+        if found.reason == "mirror" or not self.beliefs or not verify.gathered(self.beliefs, found, self.config):
             return False
         self.locked, self.margin = True, 0.0
         return verify.innovation_holds(self.beliefs[0], self.config.track)
+
+    def _renew(
+        self,
+        naming: Hypothesis,
+        new: list[Hypothesis],
+        followed: list[Track],
+        detections: Detections,
+        seen: Spots,
+    ) -> Track | None:
+        """A track from a naming, which takes over what the same names have gathered; a flip keeps its distance."""
+        begun = self._start(naming, detections, seen)
+        before = next((belief for belief in followed if (belief.name == naming.name).all()), None)
+        if begun is None or before is None:
+            return begun
+        best = max(other.log_evidence for other in new if (other.name == naming.name).all())
+        weight = before.log_weight + naming.log_evidence - best
+        return replace(begun, log_weight=weight, began_ns=before.began_ns, proof=before.proof)
 
     def _conclude(self, detections: Detections, status: Status) -> Fix:
         """The fix of the likeliest belief, as far as it can be trusted."""

@@ -68,7 +68,8 @@ class Hypothesis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Acquisition:
-    """The best hypothesis first and what else fits; `margin` is the log odds of its names against all others.
+    """The best hypothesis first, without its doubtful names, and all that fit, with them; `margin` is the log odds of its
+    names against all others.
 
     `flipped` is the other pose of the best names where the plane's flip leaves two. `reason` says why it is no answer.
     """
@@ -235,12 +236,12 @@ class _Search:
 
     def polish(self, name: Indices, R: Array, t: Array, score: float) -> _Polished:
         """Follow the best relabelling as long as it is better."""
-        found, m = self.found, len(name)
+        found, plan, m = self.found, self.plan, len(name)
         for _ in range(_MAX_RELABELLINGS):
             without, against, better = np.empty(m), np.empty(m), np.empty(m, np.int64)
             R2, t2 = np.empty((3, 3)), np.empty(3)
             best = kernel.rivals(
-                name, light_of(name, len(found.uv)), *self.head, found.uv, self.var, found.like, self.log_clutter, R, t,
+                name, light_of(name, len(found.uv)), *self.head, plan.rank, found.uv, self.var, found.like, self.log_clutter, R, t,
                 self.Rp, self.info, self.q, without, against, better, R2, t2,
             )
             if best <= score:
@@ -288,7 +289,7 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
     rest = [
         Hypothesis(name, _pose(R, t), float(s))
         for name, s, R, t in zip(listed.names, listed.scores, listed.Rs, listed.ts, strict=True)
-        if s > best - config.keep and (name != top.name).any()
+        if s > best - config.keep and (name != kept).any()
     ]
     flipped = Hypothesis(kept, _pose(R2, t2), other) if other > top.score - config.keep else None
     head = Hypothesis(kept, _pose(top.R, top.t), top.score)
@@ -308,7 +309,7 @@ def _kept(
     doubt = np.logaddexp(top.without + crowding, np.maximum(top.against, np.logaddexp.reduce(elsewhere)))
     odds = np.where(top.name >= 0, best - doubt, _NONE)
     likeliest = np.sort(odds)[::-1]
-    least = max(min(config.margin, float(likeliest[min(config.enough, len(odds)) - 1])), config.prune)
+    least = max(min(config.extra, float(likeliest[min(config.enough, len(odds)) - 1])), config.prune)
     kept = np.where(odds >= least, top.name, -1)
     count = np.bincount(plan.layer[kept >= 0], minlength=plan.n_layers)
     weak = (count < config.min_layer) & (count < count.max())

@@ -27,10 +27,17 @@ def names_of(found: Acquisition, config: MatchConfig, lights: int) -> Indices:
     return found.candidates[0].name if is_answer(found, config) else np.full(lights, -1, np.int64)
 
 
-def gathered(beliefs: list[Track], config: Config) -> bool:
-    """Whether the first of several namings followed over frames has left all others, and clutter, far behind."""
+def gathered(beliefs: list[Track], found: Acquisition, config: Config) -> bool:
+    """Whether the first of several namings followed over frames has left all others, and clutter, far behind.
+
+    And is, in this frame on its own, likelier than all that contradict it.
+    """
     first = beliefs[0]
     if first.t_ns == first.began_ns or first.n_used < _MIN_GATHERED:
+        return False
+    own = [c.log_evidence for c in found.candidates if (c.name == first.name).all()]
+    now = [c.log_evidence for c in found.candidates if contradict(first.name, c.name)]
+    if not own or (now and max(own) - max(now) < config.match.prune):
         return False
     rivals = [b.log_weight for b in beliefs[1:] if contradict(first.name, b.name)]
     against = float(np.logaddexp.reduce([-config.match.log_dock, *rivals]))

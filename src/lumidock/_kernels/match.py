@@ -22,7 +22,8 @@ LOG_VOLUME, DETECT, ABSENT, GATE, NEAR_M, FAR_M, ROLL_GATE, BEND, STEADY, STEADI
 _LOG_2PI = math.log(2.0 * math.pi)
 _EDGE_PX, _SHINES = 3.0, 0.1  # a light this near the edge, or seen this flat (cosine), may be missing at no cost
 _SAME_TURN = 2e-3  # rad; closer solutions are one
-_THIRDS, _BRANCHES = 3, 2  # third lights tried for a pair; first lights of another layer
+_THIRDS, _ALL_THIRDS = 3, 24  # third lights tried for a pair; and where three are all there may be
+_BRANCHES = 2  # first lights of another layer tried
 _HUGE = 1e300
 
 
@@ -608,7 +609,7 @@ def search(
     m, n = len(p), len(uv)
     work = np.empty((3, 6, 6))
     H, L, P = work[0], work[1], work[2]
-    sols, thirds = np.empty((2, 2)), np.empty((_THIRDS, 3))
+    sols, thirds = np.empty((2, 2)), np.empty((_THIRDS if least > 3 else _ALL_THIRDS, 3))
     name, taken = np.empty(m, np.int64), np.empty(n, np.int64)
     ps, uvs, vs = np.empty((2, 3)), np.empty((2, 2)), np.empty(2)
     R0, t0, R, t, d = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -767,6 +768,7 @@ def rivals(
     layer: Indices,
     axis: Array,
     survey_m2: Array,
+    rank: Indices,
     uv: Array,
     var: Array,
     like: Array,
@@ -782,8 +784,8 @@ def rivals(
     R2: Array,
     t2: Array,
 ) -> float:
-    """Hypotheses one relabelling away, each solved anew: a detection left out, another detection for a light, another
-    light for a detection, two lights exchanged.
+    """Hypotheses one relabelling away, each solved anew: a detection left out, with others added where they then fit,
+    another detection for a light, another light for a detection, two lights exchanged.
 
     Fills `without` (M,), the log evidence that leaves a light's detection out; `against` (M,), the log mass of those
     that name a light otherwise; and the best of all, `better` (M,), `R2`, `t2`, whose log evidence it returns.
@@ -792,6 +794,7 @@ def rivals(
     H, L, P, Hk = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     Rk, tk, R0, t0, trial = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3), name.copy()
     h, S = np.empty(14), np.empty(3)
+    grown, held, work = name.copy(), taken.copy(), np.empty((3, 6, 6))
     without[:] = -_HUGE
     against[:] = -_HUGE
     for c in range(m):
@@ -806,6 +809,17 @@ def rivals(
         without[c] = e
         if e > best:
             best, better[:], R2[:], t2[:] = e, trial, R0, t0
+        # without this name others may find their place
+        grown[:], held[:], Rk[:], tk[:] = trial, taken, R0, t0
+        grow(-1, grown, held, lens, p, layer, survey_m2, rank, uv, var, like, Rk, tk, Rp, info, q, work)
+        if _named(grown) > _named(trial):
+            e = evidence(
+                grown, lens, p, layer, axis, survey_m2, uv, var, like, log_clutter, Rk, tk, Rp, info, q, 6, Hk, L
+            )
+            against[c] = _log_add(against[c], e)
+            if e > best:
+                best, better[:], R2[:], t2[:] = e, grown, Rk, tk
+        e = without[c]
         usable = e > -_HUGE and not math.isnan(invert6(H, L, P))
         for c2 in range(m):
             if not usable or (c2 < c and name[c2] >= 0) or not light_row(lens, R0, t0, p[c2], h):
