@@ -459,7 +459,7 @@ def test_any_folder_name_can_be_told(bare, tmp_path):
 @pytest.mark.parametrize(
     ("words", "match"),
     [
-        (["nowhere"], "no such scenario; there are approach"),
+        (["nowhere"], "no such scenario; there are any-roll, approach"),
         (["nowhere.yaml"], "nowhere.yaml: No such file"),
         (["trials", "--set", "path"], "wanted key=value"),
         (["trials", "--set", "=1"], "wanted key=value"),

@@ -60,7 +60,11 @@ class Bound:
         elif t_ns - self._lights_ns > self.config.integrity.max_age_s * 1e9:
             return None
         nothing = np.zeros((len(self.station), 18))
-        return np.array(kernel.levels(R, t, self._P, nothing, track.NO_PLANE, self._factors, self._factors, False, np.empty((9, 9)))[:3])
+        return np.array(
+            kernel.levels(
+                R, t, self._P, nothing, track.NO_PLANE, self._factors, self._factors, False, np.empty((9, 9))
+            )[:3]
+        )
 
     def owes(self, t_ns: int, T_dock_cam: Array, lights: Indices) -> bool:
         """Whether a valid fix is owed in this frame: 1.3 times the bound is inside the alert limits."""
@@ -97,6 +101,21 @@ class Bound:
         self._joint = self._joint or track.is_joint(name, self._plan, self.config.track)
         n = len(self._P) if self._joint else kernel.CALIBRATION
         kernel.update(
-            self._plan.lens, R, t, R.copy(), t.copy(), np.zeros(len(self._P)), self._P, self._plan.p_dock, name, uv, cov,
-            n, 1, track.NO_PLANE, np.eye(3), False, np.zeros((len(name), 18)),
+            self._plan.lens,
+            R,
+            t,
+            R.copy(),
+            t.copy(),
+            np.zeros(len(self._P)),
+            self._P,
+            self._plan.p_dock,
+            name,
+            uv,
+            cov,
+            n,
+            1,
+            track.NO_PLANE,
+            np.eye(3),
+            False,
+            np.zeros((len(name), 18)),
         )

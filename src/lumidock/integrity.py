@@ -53,7 +53,7 @@ class Bounds:
     guide: Guide
 
 
-def bounds(beliefs: Sequence[Track], config: IntegrityConfig, *, few: bool = False) -> Bounds:
+def bounds(beliefs: Sequence[Track], config: IntegrityConfig) -> Bounds:
     """Protection of the first belief, wide enough to hold every other that is likelier than the risk.
 
     Without a fault the levels are factors on sigma; with six or more lights they also hold when any one of them is at
@@ -84,8 +84,15 @@ def _levels(track: Track, config: IntegrityConfig, cov: Array) -> Array:
     fault_risk = min(config.risk / (config.fault * max(used, 1)), 0.5)
     return np.array(
         kernel.levels(
-            track.R, track.t, track.P, track.apart, track.plane, sigma_factors(config.risk), sigma_factors(fault_risk),
-            used >= config.separate_from, cov,
+            track.R,
+            track.t,
+            track.P,
+            track.apart,
+            track.plane,
+            sigma_factors(config.risk),
+            sigma_factors(fault_risk),
+            used >= config.separate_from,
+            cov,
         )
     )
 

@@ -78,7 +78,9 @@ class Localizer:
         if self.locked and followed and not held and self._failures == 1:
             return self._coast(detections, "residual")  # one frame in many thousands fails by chance
         found = self._acquire(detections, seen)
-        if held and not track.is_joint(verify.names_of(found, self.config.match, len(self.station)), self._plan, self.config.track):
+        if held and not track.is_joint(
+            verify.names_of(found, self.config.match, len(self.station)), self._plan, self.config.track
+        ):
             self.beliefs = followed
             return self._conclude(detections, "tracking")
         if verify.is_answer(found, self.config.match) and self._lock(found, detections, seen):
@@ -123,7 +125,7 @@ class Localizer:
         return kept
 
     def _holds(self, belief: Track, seen: Spots) -> bool:
-        """Whether a followed belief passes its innovation test and does not leave an array's worth of spots unexplained.
+        """Whether a followed belief passes its innovation test and leaves no array's worth of spots unexplained.
 
         Three lights of one plane fit many poses: only a track that has seen two layers lives on less than four.
         """
@@ -221,9 +223,7 @@ class Localizer:
     def _coast(self, detections: Detections, reason: str) -> Fix:
         """No light fits: a failed test ends trust at once, a dark frame when the last light is too old."""
         nothing = np.full(len(self.station), -1, np.int64)
-        self.beliefs = [
-            replace(b, name=nothing, proof=0 if reason == "residual" else b.proof) for b in self.beliefs
-        ]
+        self.beliefs = [replace(b, name=nothing, proof=0 if reason == "residual" else b.proof) for b in self.beliefs]
         age_s = (detections.t_ns - self.beliefs[0].lights_ns) * 1e-9
         if reason == "residual" or age_s > self.config.integrity.max_age_s:
             return self._no_fix(detections, "coasting", "residual" if reason == "residual" else "stale")

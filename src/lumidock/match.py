@@ -1,8 +1,9 @@
 """Cold start: which detection is which light, over all layers at once, with what else it could be.
 
-The model: Poisson clutter, a detection probability per light, Gaussian centres, a Gaussian prior on the attitude, a flat
-one on the position inside the view cone. The score of a naming is its log evidence over "all clutter", with the pose
-integrated out by Laplace's method (D. MacKay, "Information Theory, Inference, and Learning Algorithms", ch. 27).
+The model: spurious spots of geometric number, a detection probability per light, Gaussian centres, a prior on the
+attitude, one on the position that is half flat in the view cone and half flat in log distance. The score of a naming
+is its log evidence over "all clutter", with the pose integrated out by Laplace's method (D. MacKay, "Information
+Theory, Inference, and Learning Algorithms", ch. 27).
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _FLAT = 0.05  # a layer less thick than this share of its width is a plane
 class Plan:
     """A station as the search wants it: M lights, the order in which pairs are tried, and what is unseen before each.
 
-    `survey_m2` (M,) variance of a light's position; `rank` (M,) within its layer; `unseen` (S,) the most lights of a naming without the pairs before.
+    `survey_m2` (M,) variance of a light's position; `rank` (M,) within its layer; `unseen` (S,) the most lights of one
+    layer in a naming without the pairs before.
     """
 
     lens: Array
@@ -49,8 +51,10 @@ class Plan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """Attitude expected: `R_dock_cam` (3, 3), 1/variance (3,) of tilt toward cam x, toward cam y, and of roll, and whether
-    a sensor measured it."""
+    """An attitude expected.
+
+    `R_dock_cam` (3, 3); 1/variance (3,) of tilt toward cam x, toward cam y, and of roll; whether a sensor measured it.
+    """
 
     R_dock_cam: Array
     info: Array
@@ -59,7 +63,7 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
-    """A naming (M,): the detection of each light or -1; the pose that fits it best and its log evidence over clutter."""
+    """A naming (M,): the detection of each light or -1; the pose that fits it best; its log evidence over clutter."""
 
     name: Indices
     T_cam_dock: Array
@@ -68,9 +72,9 @@ class Hypothesis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Acquisition:
-    """The best hypothesis first, without its doubtful names, and all that fit, with them; `margin` is the log odds of its
-    names against all others.
+    """The best hypothesis first, without its doubtful names, and all that fit, with them.
 
+    `margin` is the log odds of its names against all others.
     `flipped` is the other pose of the best names where the plane's flip leaves two. `reason` says why it is no answer.
     """
 
@@ -90,8 +94,19 @@ def plan(station: Station, camera: Camera, config: MatchConfig) -> Plan:
     volume = float(size.prod()) * config.far_m**3 / 3.0
     is_rear = (behind == len(front_first) - 1).astype(np.int64)
     return Plan(
-        camera.lens(), np.ascontiguousarray(station.p_dock), station.layer, station.axis, survey_m2, rank, pairs, unseen,
-        len(station.layers), is_rear, _planes(station), math.log(volume), station.sigma_focal,
+        camera.lens(),
+        np.ascontiguousarray(station.p_dock),
+        station.layer,
+        station.axis,
+        survey_m2,
+        rank,
+        pairs,
+        unseen,
+        len(station.layers),
+        is_rear,
+        _planes(station),
+        math.log(volume),
+        station.sigma_focal,
     )
 
 
@@ -106,7 +121,7 @@ def _planes(station: Station) -> Array:
 
 
 def _pair_order(station: Station) -> tuple[Indices, Indices, Indices]:
-    """Rank (M,) of each light in its layer, well-spread ones first; pairs (S, 2) of one layer; unseen (S,) before each."""
+    """Rank (M,) of each light in its layer, spread ones first; pairs (S, 2) of one layer; unseen (S,) before each."""
     orders = [_spread_order(station.p_dock[lights], lights) for lights in map(station.lights_of, station.layers)]
     done = [0] * len(orders)
     pairs, unseen = [], []
@@ -150,7 +165,7 @@ def prior(attitude: Attitude | None, config: PriorConfig) -> Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spots:
-    """Detections as the kernels want them: `uv`, covariance and variance px^2 of N centres, log likelihood ratios (N, L).
+    """Detections as the kernels want them: N centres, their covariance and variance px^2, log likelihood ratios (N, L).
 
     `log_density` 1/px^2 of spurious spots: geometric in number about `spurious`, a share of them where the detections
     stand.
@@ -195,7 +210,9 @@ def _parameters(plan: Plan, config: MatchConfig, tilt_var: float, roll_sigma: fl
 class _Search:
     """One frame's arguments to the kernels, for the true array or its mirror image."""
 
-    def __init__(self, plan: Plan, found: Spots, ray: Array, expected: Prior, config: MatchConfig, *, mirrored: bool) -> None:
+    def __init__(
+        self, plan: Plan, found: Spots, ray: Array, expected: Prior, config: MatchConfig, *, mirrored: bool
+    ) -> None:
         flip = _MIRROR if mirrored else np.ones(3)
         self.plan, self.found, self.config = plan, found, config
         offset = (found.uv - plan.lens[3:5]) * (0.5 * plan.sigma_focal)
@@ -217,8 +234,26 @@ class _Search:
         Rs, ts = np.empty((k, 3, 3)), np.empty((k, 3))
         for least in leasts:
             count = kernel.search(
-                *self.head, plan.rank, found.uv, self.ray, self.var, found.like, self.log_clutter, self.Rp, self.info,
-                self.q, plan.pairs, plan.unseen, floor, least, best, count, names, scores, Rs, ts,
+                *self.head,
+                plan.rank,
+                found.uv,
+                self.ray,
+                self.var,
+                found.like,
+                self.log_clutter,
+                self.Rp,
+                self.info,
+                self.q,
+                plan.pairs,
+                plan.unseen,
+                floor,
+                least,
+                best,
+                count,
+                names,
+                scores,
+                Rs,
+                ts,
             )
             sure = count > 0 and scores[:count].max() > self.config.sure
             if sure or len(found.uv) > self.config.max_spots_three:
@@ -241,8 +276,24 @@ class _Search:
             without, against, better = np.empty(m), np.empty(m), np.empty(m, np.int64)
             R2, t2 = np.empty((3, 3)), np.empty(3)
             best = kernel.rivals(
-                name, light_of(name, len(found.uv)), *self.head, plan.rank, found.uv, self.var, found.like, self.log_clutter, R, t,
-                self.Rp, self.info, self.q, without, against, better, R2, t2,
+                name,
+                light_of(name, len(found.uv)),
+                *self.head,
+                plan.rank,
+                found.uv,
+                self.var,
+                found.like,
+                self.log_clutter,
+                R,
+                t,
+                self.Rp,
+                self.info,
+                self.q,
+                without,
+                against,
+                better,
+                R2,
+                t2,
             )
             if best <= score:
                 break
@@ -297,9 +348,7 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
     return Acquisition((head, *rest), flipped, best - against, reason)
 
 
-def _kept(
-    top: _Polished, best: float, listed: _Listed, crowding: float, plan: Plan, config: MatchConfig
-) -> Indices:
+def _kept(top: _Polished, best: float, listed: _Listed, crowding: float, plan: Plan, config: MatchConfig) -> Indices:
     """The naming (M,) without what is not beyond doubt: single names, and layers with too few of them.
 
     The names beyond doubt stay; where they are fewer than `enough`, the likeliest of the others fill up.

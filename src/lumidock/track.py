@@ -101,13 +101,32 @@ def start(
     R0, t0 = T_cam_dock[:3, :3].copy(), T_cam_dock[:3, 3].copy()
     kernel.attitude_update(R0, t0, x, P, expected.R_dock_cam, 1.0 / expected.info, expected.measured)
     never = np.full(plan.n_layers, _NEVER, np.int64)
-    fresh = Track(t_ns, t_ns, R0, t0, x, P, False, 0.0, 0, t_ns, never, name, np.zeros((len(name), 18)), NO_PLANE, np.nan, 0.0, 0.0)
+    fresh = Track(
+        t_ns,
+        t_ns,
+        R0,
+        t0,
+        x,
+        P,
+        False,
+        0.0,
+        0,
+        t_ns,
+        never,
+        name,
+        np.zeros((len(name), 18)),
+        NO_PLANE,
+        np.nan,
+        0.0,
+        0.0,
+    )
     begun = update(fresh, name, seen, plan, config, at=T_cam_dock)
     for _ in range(_FLATTENINGS):
         if begun is None or not np.isfinite(begun.plane[0]):
             break
-        before, begun = begun, update(
-            fresh, name, seen, plan, config, at=begun.T_cam_dock, turn_cov=begun.P[3:6, 3:6].copy()
+        before, begun = (
+            begun,
+            update(fresh, name, seen, plan, config, at=begun.T_cam_dock, turn_cov=begun.P[3:6, 3:6].copy()),
         )
         if begun is not None and np.trace(begun.P[3:6, 3:6]) < 1.02 * np.trace(before.P[3:6, 3:6]):
             break
@@ -130,9 +149,7 @@ def start_states(station: Station, attitude: Attitude | None, config: TrackConfi
 def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
     """The track at a later time, its twist held but for white noise on it."""
     R, t, P = track.R.copy(), track.t.copy(), track.P.copy()
-    kernel.predict(
-        R, t, track.x[6:12], P, (t_ns - track.t_ns) * 1e-9, config.accel_m_s2**2, config.accel_rad_s2**2
-    )
+    kernel.predict(R, t, track.x[6:12], P, (t_ns - track.t_ns) * 1e-9, config.accel_m_s2**2, config.accel_rad_s2**2)
     return replace(track, t_ns=t_ns, R=R, t=t, P=P)
 
 
@@ -177,8 +194,20 @@ def _search(expected: Array, S: Array, shown: Array, seen: Spots, plan: Plan, co
     m = len(shown)
     names, costs = np.full((_LEAVES, m), -1, np.int64), np.empty(_LEAVES)
     found = kernel.associate(
-        expected, S, shown, plan.layer, seen.uv, seen.var, seen.like, seen.log_density, config.match.detect,
-        config.track.gate, config.track.reach, config.track.max_nodes, names, costs,
+        expected,
+        S,
+        shown,
+        plan.layer,
+        seen.uv,
+        seen.var,
+        seen.like,
+        seen.log_density,
+        config.match.detect,
+        config.track.gate,
+        config.track.reach,
+        config.track.max_nodes,
+        names,
+        costs,
     )
     name, worth = names[0], -costs[:found]
     if found > 1:
@@ -208,10 +237,23 @@ def update(
     R, t = (track.R.copy(), track.t.copy()) if at is None else (at[:3, :3].copy(), at[:3, 3].copy())
     apart, plane = np.zeros((len(name), 18)), _plane(name, plan, joint=track.joint)
     nis, _ = kernel.update(
-        plan.lens, R0, t0, R, t, x, P, plan.p_dock, name, seen.uv, seen.cov,
-        len(P) if joint else kernel.CALIBRATION, _TRACK_STEPS if at is None else _SOLVE_STEPS,
+        plan.lens,
+        R0,
+        t0,
+        R,
+        t,
+        x,
+        P,
+        plan.p_dock,
+        name,
+        seen.uv,
+        seen.cov,
+        len(P) if joint else kernel.CALIBRATION,
+        _TRACK_STEPS if at is None else _SOLVE_STEPS,
         NO_PLANE if at is not None and turn_cov is None else plane,
-        P[3:6, 3:6].copy() if turn_cov is None else turn_cov, at is None, apart,
+        P[3:6, 3:6].copy() if turn_cov is None else turn_cov,
+        at is None,
+        apart,
     )
     if not np.isfinite(nis):
         return None
@@ -220,15 +262,30 @@ def update(
     surprise = _deviate(nis, 2 * int(count.sum()))
     proof = track.proof + int(count.sum() >= _PROOF_LIGHTS)
     return Track(
-        track.t_ns, track.began_ns, R, t, x, P, joint, track.log_weight, proof, track.t_ns, layer_ns, name, apart, plane, nis,
-        surprise, config.strain_memory * track.strain + math.sqrt(1.0 - config.strain_memory**2) * surprise,
+        track.t_ns,
+        track.began_ns,
+        R,
+        t,
+        x,
+        P,
+        joint,
+        track.log_weight,
+        proof,
+        track.t_ns,
+        layer_ns,
+        name,
+        apart,
+        plane,
+        nis,
+        surprise,
+        config.strain_memory * track.strain + math.sqrt(1.0 - config.strain_memory**2) * surprise,
     )
 
 
 def _deviate(square: float, dof: int) -> float:
     """A chi-square value as a standard normal deviate. Source: E. Wilson, M. Hilferty, 1931."""
     spread = 2.0 / (9.0 * dof)
-    return ((square / dof) ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(spread)
+    return float(((square / dof) ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(spread))
 
 
 def _plane(name: Indices, plan: Plan, *, joint: bool) -> Array:

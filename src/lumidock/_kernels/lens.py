@@ -59,9 +59,17 @@ def _project_equidistant(lens: Array, x: float, y: float, z: float) -> Projectio
     slope = 1.0 + w * (3.0 * k[0] + w * (5.0 * k[1] + w * (7.0 * k[2] + w * 9.0 * k[3])))
     if r < 1e-9 * abs(z):
         scale = 1.0 / abs(z)
-        return True, x * scale * lens[1] + lens[3], y * scale * lens[2] + lens[4], scale * lens[1], 0.0, 0.0, 0.0, (
-            scale * lens[2]
-        ), 0.0
+        return (
+            True,
+            x * scale * lens[1] + lens[3],
+            y * scale * lens[2] + lens[4],
+            scale * lens[1],
+            0.0,
+            0.0,
+            0.0,
+            (scale * lens[2]),
+            0.0,
+        )
     scale, norm2 = bent / r, r * r + z * z
     radial = slope * z / norm2 - scale
     a, b = x / r, y / r
@@ -76,7 +84,7 @@ def _project_equidistant(lens: Array, x: float, y: float, z: float) -> Projectio
 def inside(lens: Array, u: float, v: float, margin_px: float) -> bool:
     """Whether a pixel lies in the picture by at least `margin_px`."""
     edge = margin_px - 0.5
-    return edge < u < lens[6] - 0.5 - margin_px and edge < v < lens[7] - 0.5 - margin_px
+    return bool(edge < u < lens[6] - 0.5 - margin_px and edge < v < lens[7] - 0.5 - margin_px)
 
 
 @njit(cache=True, error_model="numpy")

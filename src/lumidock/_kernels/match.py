@@ -1,9 +1,9 @@
 """The search for the most probable naming of detections without history, and the rivals next to it.
 
 Arrays of one frame: `uv` (N, 2) px, `var` (N,) px^2, `like` (N, L) log likelihood ratio of each detection for each
-layer. `log_clutter` (N + 1,)
-log price of naming so many detections. Of the station: `p` (M, 3), `layer` (M,), `axis` (M, 3), `survey_m2` (M,) variance of a light's position.
-A hypothesis is `name` (M,): the detection that each light is given, or -1; and its pose `R`, `t` of T_cam_dock.
+layer, `log_clutter` (N + 1,) log price of naming so many detections. Of the station: `p` (M, 3), `layer` (M,), `axis`
+(M, 3), `survey_m2` (M,) variance of a light's position, `rank` (M,) in its layer. A hypothesis is `name` (M,): the
+detection that each light is given, or -1; and its pose `R`, `t` of T_cam_dock.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _HUGE = 1e300
 
 @njit(cache=True, error_model="numpy")
 def depth(R: Array, t: Array, p: Array) -> float:
-    """z m in `cam` of the light at `p` (3,)."""
+    """Depth z m in `cam` of the light at `p` (3,)."""
     return R[2, 0] * p[0] + R[2, 1] * p[1] + R[2, 2] * p[2] + t[2]
 
 
@@ -326,9 +326,7 @@ def _reachable(
 
 
 @njit(cache=True, error_model="numpy")
-def _pair_pose(
-    d: Array, ray_i: Array, ray_j: Array, q: Array, out: Array
-) -> int:
+def _pair_pose(d: Array, ray_i: Array, ray_j: Array, q: Array, out: Array) -> int:
     """Depth of the first light and roll that put two lights `d` (3,) apart in the prior's `cam` axes on two rays.
 
     Fills up to two rows of `out` (2, 2); returns how many lie within the gates.
@@ -359,7 +357,7 @@ def _pair_pose(
 
 @njit(cache=True, error_model="numpy")
 def _contains(names: Indices, count: int, a: int, i: int, b: int, j: int) -> bool:
-    for k in range(count):
+    for k in range(count):  # noqa: SIM110 - numba compiles no generator
         if names[k, a] == i and names[k, b] == j:
             return True
     return False
@@ -437,7 +435,9 @@ def _others(
             best, best_name[:], best_R[:], best_t[:] = z, name, Rm, tm
         if z <= -_HUGE or math.isnan(invert6(H, L, P)):
             continue
-        found = _best_light(-1, name, taken, lens, p, layer, survey_m2, uv, var, like, Rm, tm, P, q[GATE], 0.0, -1, rank, out)
+        found = _best_light(
+            -1, name, taken, lens, p, layer, survey_m2, uv, var, like, Rm, tm, P, q[GATE], 0.0, -1, rank, out
+        )
         kept = _most_supported(out, found, name, taken, lens, p, layer, survey_m2, uv, var, Rm, tm, P, q[GATE], tops)
         for k in range(kept):
             trial, held, Rk, tk = name.copy(), taken.copy(), Rm.copy(), tm.copy()
@@ -550,9 +550,7 @@ def _most_supported(
 
 
 @njit(cache=True, error_model="numpy")
-def _condition(
-    h: Array, P: Array, S: Array, du: float, dv: float, P2: Array, gain: Array, shift: Array
-) -> None:
+def _condition(h: Array, P: Array, S: Array, du: float, dv: float, P2: Array, gain: Array, shift: Array) -> None:
     """Kalman update of a pose's covariance `P` by one pixel: `P2`, and the `shift` (6,) of the pose."""
     det = S[0] * S[2] - S[1] * S[1]
     for n in range(6):
@@ -598,13 +596,13 @@ def search(
     Rs: Array,
     ts: Array,
 ) -> int:
-    """Add the best hypotheses to the list `names` (K, M), `scores` (K,), `Rs`, `ts` of `count`; returns how many there are.
+    """Add the best hypotheses to the list `names` (K, M), `scores` (K,), `Rs`, `ts` of `count`. Returns how many.
 
     `pairs` (S, 2) are lights of one layer, in order; `unseen` (S,) is the most lights of one layer that a hypothesis
     can name without naming any pair before that one. The search stops when what it has not seen cannot come within one
-    light of the best, nor within two in any one layer, so that it is exhaustive in what matters. `floor` is that bound at the start; `least` how many lights of
-    one layer a hypothesis must name, `best` a log evidence to measure up to. A third light comes after both of a pair
-    in `rank` (M,), so that each triple is tried once.
+    light of the best, nor within two in any one layer, so that it is exhaustive in what matters. `floor` is that bound
+    at the start; `least` how many lights of one layer a hypothesis must name, `best` a log evidence to measure up to. A
+    third light comes after both of a pair in `rank` (M,), so that each triple is tried once.
     """
     m, n = len(p), len(uv)
     work = np.empty((3, 6, 6))
@@ -625,8 +623,8 @@ def search(
         a, b = pairs[s, 0], pairs[s, 1]
         for k in range(3):  # R_cam_dock of the prior is Rp^T
             d[k] = 0.0
-            for l in range(3):
-                d[k] += Rp[l, k] * (p[b, l] - p[a, l])
+            for o in range(3):
+                d[k] += Rp[o, k] * (p[b, o] - p[a, o])
         for i in range(n):
             if not ray[i, 2] > 0.0:
                 continue
@@ -649,8 +647,24 @@ def search(
                     taken[:] = -1
                     name[a], name[b], taken[i], taken[j] = i, j, a, b
                     found = _best_light(
-                        layer[a], name, taken, lens, p, layer, survey_m2, uv, var, like, R0, t0, P, q[GATE], q[BEND],
-                        max(rank[a], rank[b]), rank, thirds,
+                        layer[a],
+                        name,
+                        taken,
+                        lens,
+                        p,
+                        layer,
+                        survey_m2,
+                        uv,
+                        var,
+                        like,
+                        R0,
+                        t0,
+                        P,
+                        q[GATE],
+                        q[BEND],
+                        max(rank[a], rank[b]),
+                        rank,
+                        thirds,
                     )
                     wanted = max(least, in_layer, (max(most, floor) + layers - 1) // layers)
                     if wanted > 3 and _reachable(layer[a], name, taken, lens, p, layer, survey_m2, uv, R0, t0, P, q) < (
@@ -672,14 +686,49 @@ def search(
                         name[c], taken[o] = o, c
                         R[:], t[:] = R0, t0
                         cost, log_det, log_var = grow(
-                            layer[a], name, taken, lens, p, layer, survey_m2, rank, uv, var, like, R, t, Rp, info, q, work
+                            layer[a],
+                            name,
+                            taken,
+                            lens,
+                            p,
+                            layer,
+                            survey_m2,
+                            rank,
+                            uv,
+                            var,
+                            like,
+                            R,
+                            t,
+                            Rp,
+                            info,
+                            q,
+                            work,
                         )
-                        e = log_evidence(name, lens, p, layer, axis, like, log_clutter, R, t, info, q, cost, log_det, log_var)
+                        e = log_evidence(
+                            name, lens, p, layer, axis, like, log_clutter, R, t, info, q, cost, log_det, log_var
+                        )
                         if e <= -_HUGE or _named(name) < least:
                             continue
                         if e > best - 10.0 or (e > 0.0 and _named(name) > 3):
                             e = _others(
-                                name, taken, lens, p, layer, axis, survey_m2, rank, uv, var, like, log_clutter, R, t, Rp, info, q, work
+                                name,
+                                taken,
+                                lens,
+                                p,
+                                layer,
+                                axis,
+                                survey_m2,
+                                rank,
+                                uv,
+                                var,
+                                like,
+                                log_clutter,
+                                R,
+                                t,
+                                Rp,
+                                info,
+                                q,
+                                work,
                             )
                         if _named(name) < floor:
                             continue
@@ -784,11 +833,12 @@ def rivals(
     R2: Array,
     t2: Array,
 ) -> float:
-    """Hypotheses one relabelling away, each solved anew: a detection left out, with others added where they then fit,
-    another detection for a light, another light for a detection, two lights exchanged.
+    """Hypotheses one relabelling away, each solved anew.
 
-    Fills `without` (M,), the log evidence that leaves a light's detection out; `against` (M,), the log mass of those
-    that name a light otherwise; and the best of all, `better` (M,), `R2`, `t2`, whose log evidence it returns.
+    A detection left out, with others added where they then fit; another detection for a light; another light for a
+    detection; two lights exchanged. Fills `without` (M,), the log evidence that leaves a light's detection out;
+    `against` (M,), the log mass of those that name a light otherwise; and the best of all, `better` (M,), `R2`, `t2`,
+    whose log evidence it returns.
     """
     m, best = len(name), -_HUGE
     H, L, P, Hk = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
@@ -803,9 +853,7 @@ def rivals(
             continue
         trial[c] = -1
         R0[:], t0[:] = R, t
-        e = evidence(
-            trial, lens, p, layer, axis, survey_m2, uv, var, like, log_clutter, R0, t0, Rp, info, q, 6, H, L
-        )
+        e = evidence(trial, lens, p, layer, axis, survey_m2, uv, var, like, log_clutter, R0, t0, Rp, info, q, 6, H, L)
         without[c] = e
         if e > best:
             best, better[:], R2[:], t2[:] = e, trial, R0, t0
@@ -856,7 +904,7 @@ def rivals(
 def weigh(
     uv: Array, cov: Array, p_rear: Array, p_light: Array, is_rear: Indices, trust: float, like: Array, var: Array
 ) -> float:
-    """Fill `like` (N, L), softened log likelihood ratios, and `var` (N,) px^2 per axis; area px^2 that the spots span."""
+    """Fill `like` (N, L), softened log likelihood ratios, and `var` (N,) px^2 per axis; the area px^2 of all spots."""
     low_u, high_u, low_v, high_v = np.inf, -np.inf, np.inf, -np.inf
     layers = len(is_rear)
     for i in range(len(uv)):

@@ -61,7 +61,7 @@ def _add_prior(R: Array, Rp: Array, info: Array, H: Array, g: Array) -> float:
 
 @njit(cache=True, error_model="numpy")
 def light_row(lens: Array, R: Array, t: Array, p: Array, h: Array) -> bool:
-    """Pixel and pose Jacobian of the light at `p` (3,): fills `h` (14,) = u, v, then the two rows of 6; False if unseen.
+    """Pixel and pose Jacobian of the light at `p` (3,), into `h` (14,): u, v, then the two rows of 6; False if unseen.
 
     Columns 0..2 of a row are also the Jacobian for a shift of the light in `dock`.
     """

@@ -149,7 +149,7 @@ def _difference(R0: Array, t0: Array, R: Array, t: Array, dx: Array) -> None:
 
 @njit(cache=True, error_model="numpy")
 def _row(lens: Array, R: Array, t: Array, x: Array, p: Array, c: int, at: Array, h: Array, cal: Array) -> bool:
-    """Pixel, pose and calibration Jacobian of light `c`: `h` (14,) as in `light_row`, `cal` (4,) d/df of u, v and scale."""
+    """Pixel, pose and calibration Jacobian of light `c`: `h` (14,) as in `light_row`, `cal` (4,) with du/df, dv/df."""
     for k in range(3):
         at[k] = p[c, k] + x[LIGHTS + 3 * c + k]
     if not light_row(lens, R, t, at, h):
@@ -463,10 +463,10 @@ def update(
     tracking: bool,
     apart: Array,
 ) -> tuple[float, float]:
-    """Take in the named pixels, all in one, relinearised up to `steps` times; in place. Returns NIS and rms residual px.
+    """Take in the named pixels, all in one, relinearised up to `steps` times; in place. Returns NIS and rms residual.
 
-    `R0`, `t0` are the mean that `P` belongs to, `R`, `t` where to linearise first. Where the lights are one `plane` (6,)
-    (a point and the normal; NaN: none), the covariance is that of the flattest view within three sigmas of tilt by
+    `R0`, `t0` are the mean that `P` belongs to, `R`, `t` where to linearise first. Where the lights are one `plane`
+    (6,) (a point and the normal; NaN: none), the covariance is that of the flattest view within three sigmas of tilt by
     `turn_cov` (3, 3): seen at a slant by mistake, a plane would seem to tell its tilt. When `tracking` the gain is that
     of the flattest view as well, so that history rests on perspective and not on the choice between two slants.
 
@@ -554,8 +554,9 @@ def _whiten(
     G: Array,
     Z: Array,
 ) -> bool:
-    """Jacobian `rows`, `cals` of `m` named lights, the Cholesky factor `Z` of their innovation's covariance, and `G`,
-    L^-1 H P (2 m, n); False where a light is out of the lens's sight.
+    """Fill `rows` and `cals` of `m` named lights, `Z`, the factor L of their innovation's covariance, and `G`, L^-1 H P.
+
+    False where a light is out of the lens's sight.
     """
     n, at = len(P), np.empty(3)
     for k in range(m):
@@ -638,9 +639,9 @@ def _separate(
 
 @njit(cache=True, error_model="numpy")
 def outputs(R: Array, t: Array) -> Array:
-    """Jacobian (9, 6) of what a fix says, for the pose's tangent: error x, y, z, wx, wy, wz in dock axes as estimate minus
-    truth, bearing x, bearing y rad, range m.
+    """Jacobian (9, 6) of what a fix says for the pose's tangent.
 
+    Error x, y, z, wx, wy, wz in dock axes as estimate minus truth, bearing x, bearing y rad, range m:
     T_cam_dock_true = T_cam_dock Exp(xi) makes t_est - t_true = rho + omega x t and R_est = Exp(omega) R_true.
     """
     C = np.zeros((9, 6))

@@ -1,0 +1,205 @@
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import assert_close
+from scipy.stats import chi
+
+from lumidock import integrity, match, track, trust
+from lumidock.camera import load_camera
+from lumidock.config import Config, IntegrityConfig
+from lumidock.datatypes import Guide, Protection
+from lumidock.geometry import bearing_and_range, se3_exp, se3_inverse
+from lumidock.integrity import Bounds, alert_limit, alert_limits, bounds, guide_holds, pose_holds, sigma_factors
+from lumidock.station import load_station
+from lumidock.track import NO_PLANE, Track
+
+ROOT = Path(__file__).parents[1]
+STATION = load_station(ROOT / "stations" / "cage-2x2x5.yaml")
+CAMERA = load_camera(ROOT / "cameras" / "imx264-60deg.yaml")
+PLAN = match.plan(STATION, CAMERA, Config().match)
+M = len(STATION)
+
+
+def belief(T_dock_cam, P6, *, lights=4, log_weight=0.0, apart=None):
+    """A track that holds `T_dock_cam` possible with the pose covariance `P6` (6, 6)."""
+    T_cam_dock = se3_inverse(T_dock_cam)
+    x, P = track.slow_states(STATION, None)
+    P[:6, :6] = P6
+    name = np.where(np.arange(M) < lights, np.arange(M), -1)
+    apart = np.zeros((M, 18)) if apart is None else apart
+    R, t = np.ascontiguousarray(T_cam_dock[:3, :3]), np.ascontiguousarray(T_cam_dock[:3, 3])
+    never = np.zeros(2, np.int64)
+    return Track(0, 0, R, t, x, P, False, log_weight, 2, 0, never, name, apart, NO_PLANE, 1.0, 0.0, 0.0)
+
+
+def at(z, rng=None):
+    """A pose `T_dock_cam` at `z` m, head-on or a little off."""
+    T = np.eye(4)
+    T[:3, :3], T[2, 3] = np.diag([1.0, -1.0, -1.0]), z
+    return T if rng is None else T @ se3_exp(rng.uniform(-1, 1, 6) * [1, 1, 1, 0.1, 0.1, 0.3])
+
+
+def covariance(rng, sigma=(0.01, 0.01, 0.03, 0.002, 0.002, 0.001)):
+    """A correlated pose covariance (6, 6), small enough to be linear."""
+    A = np.diag(sigma) @ rng.normal(size=(6, 9)) / 3.0
+    return A @ A.T
+
+
+def sizes(T_dock_cam, truth):
+    """Lateral m, axial m, angle rad, bearing rad and range m of an error (5,)."""
+    e = trust.pose_error(T_dock_cam, truth)
+    b = np.array(bearing_and_range(T_dock_cam)) - np.array(bearing_and_range(truth))
+    return [math.hypot(e[0], e[1]), abs(e[2]), np.linalg.norm(e[3:]), math.hypot(b[0], b[1]), abs(b[2])]
+
+
+def levels_of(bound):
+    p, g = bound.protection, bound.guide
+    return np.array([p.lateral_m, p.axial_m, p.angle_rad, g.pl_bearing_rad, g.pl_range_m])
+
+
+@pytest.mark.parametrize(
+    ("z_m", "limit_m", "limit_deg"),
+    [(-3, 0.3, 5), (1.49, 0.3, 5), (1.5, 0.5, 5), (4.99, 0.5, 5), (5, 1, 8), (11.99, 1, 8), (12, 1.2, 10), (30, 3, 10)],
+)
+def test_alert_limit_is_the_contracts(z_m, limit_m, limit_deg):
+    assert_close(alert_limit(z_m, 0.0), (limit_m, math.radians(limit_deg)))
+
+
+def test_alert_limits_are_the_same_one_by_one_and_rise_with_distance(rng):
+    z, axial = rng.uniform(-4, 35, 500), rng.exponential(0.5, 500)
+    metres, angle = alert_limits(z, axial)
+    assert_close(np.array([alert_limit(a, b) for a, b in zip(z, axial, strict=True)]), np.stack([metres, angle], 1))
+    order = np.argsort(z - axial)
+    assert (np.diff(metres[order]) >= 0).all()
+    assert (np.diff(angle[order]) >= 0).all()
+    # the strictest limit anywhere in z +- pl
+    inside = z[:, None] + axial[:, None] * np.linspace(-1, 1, 21)
+    strictest, least = alert_limits(inside, np.zeros_like(inside))
+    assert_close(strictest.min(axis=1), metres)
+    assert_close(least.min(axis=1), angle)
+
+
+@pytest.mark.parametrize("risk", [0.5, 0.05, 1e-3, 1e-6, 1e-9])
+def test_sigma_factors_are_those_of_the_chi_distribution(risk):
+    assert_close(sigma_factors(risk), chi.isf(risk, [1, 2, 3]), atol=1e-6)
+
+
+@pytest.mark.parametrize("z_m", [1.0, 6.0, 20.0])
+def test_levels_hold_as_often_as_they_say(z_m, rng):
+    risk, n = 0.02, 4000
+    T_dock_cam, P6 = at(z_m, rng), covariance(rng)
+    bound = bounds([belief(T_dock_cam, P6)], IntegrityConfig(risk=risk))
+    draws = rng.multivariate_normal(np.zeros(6), P6, n)
+    truths = [se3_inverse(se3_inverse(T_dock_cam) @ se3_exp(xi)) for xi in draws]
+    over = np.mean([np.array(sizes(T_dock_cam, truth)) > levels_of(bound) for truth in truths], axis=0)
+    slack = 4.0 * math.sqrt(risk / n)
+    assert (over <= risk + slack).all(), over
+    assert abs(over[[1, 4]] - risk).max() < slack  # in one dimension the level is exact
+    assert (over > 0.0).any()
+    errors = np.array([trust.pose_error(T_dock_cam, truth) for truth in truths])
+    scale = np.sqrt(np.diagonal(bound.covariance))
+    assert_close(np.cov(errors.T) / np.outer(scale, scale), bound.covariance / np.outer(scale, scale), atol=0.12)
+    assert abs(trust.nees(errors, np.repeat(bound.covariance[None], n, axis=0)).mean() - 6.0) < 0.3
+
+
+def test_bounds_say_where_the_dock_is(rng):
+    T_dock_cam = at(8.0, rng)
+    bound = bounds([belief(T_dock_cam, covariance(rng))], IntegrityConfig())
+    assert_close(bound.T_dock_cam, T_dock_cam, atol=1e-12)
+    guide = bound.guide
+    expected = bearing_and_range(T_dock_cam)
+    assert_close([guide.bearing_x_rad, guide.bearing_y_rad, guide.range_m], expected)
+
+
+def test_levels_rise_with_the_covariance_and_with_less_risk(rng):
+    T_dock_cam, P6 = at(8.0, rng), covariance(rng)
+    config = IntegrityConfig()
+    plain = levels_of(bounds([belief(T_dock_cam, P6)], config))
+    assert_close(levels_of(bounds([belief(T_dock_cam, 4.0 * P6)], config)), 2.0 * plain, rtol=1e-9)
+    more = covariance(rng)
+    assert (levels_of(bounds([belief(T_dock_cam, P6 + more)], config)) >= plain).all()
+    assert (levels_of(bounds([belief(T_dock_cam, P6)], IntegrityConfig(risk=1e-7))) > plain).all()
+
+
+def test_levels_hold_every_other_belief_that_is_not_out_of_the_question(rng):
+    config = IntegrityConfig()
+    for _ in range(20):
+        T_a, T_b = at(8.0, rng), at(9.0, rng)
+        a = belief(T_a, covariance(rng))
+        near = belief(T_b, covariance(rng), log_weight=-10.0)
+        far = replace(near, log_weight=-15.0)  # e^-15 < 1e-6
+        wide = levels_of(bounds([a, near], config))
+        assert (wide[:2] >= np.array(sizes(T_a, T_b))[:2]).all()
+        assert wide[2] >= np.linalg.norm(trust.pose_error(T_a, T_b)[3:])
+        assert (wide >= levels_of(bounds([near], config))).all()
+        assert_close(levels_of(bounds([a, far], config)), levels_of(bounds([a], config)))
+
+
+def test_a_light_that_pulls_the_pose_widens_the_levels_from_six_lights_on(rng):
+    T_dock_cam, P6, config = at(8.0, rng), covariance(rng), IntegrityConfig()
+    apart = np.zeros((M, 18))
+    apart[2, :9] = [0.5, -0.3, 0.7, 0.01, 0.02, -0.03, 0.02, 0.03, 0.6]
+    apart[2, 9:] = 1e-5
+    plain = levels_of(bounds([belief(T_dock_cam, P6, lights=6)], config))
+    five, six = (levels_of(bounds([belief(T_dock_cam, P6, lights=n, apart=apart)], config)) for n in (5, 6))
+    assert_close(five, plain)
+    moved = [math.hypot(0.5, 0.3), 0.7, np.linalg.norm([0.01, 0.02, 0.03]), math.hypot(0.02, 0.03), 0.6]
+    assert (six > np.maximum(plain, moved)).all()
+
+
+def test_a_light_that_cannot_be_left_out_leaves_no_level(rng):
+    apart = np.zeros((M, 18))
+    apart[1, 9:] = np.inf
+    bound = bounds([belief(at(8.0, rng), covariance(rng), lights=7, apart=apart)], IntegrityConfig())
+    assert np.isinf(levels_of(bound)).all()
+    assert not pose_holds(bound)
+    assert not guide_holds(bound)
+
+
+def bound_of(z, lateral=0.01, axial=0.01, angle=0.01, bearing=0.001, distance=0.01, *, x=0.0):
+    T = at(z)
+    T[0, 3] = x
+    guide = Guide(*bearing_and_range(T), bearing, distance)
+    return Bounds(T, np.eye(6), Protection(lateral, axial, angle), guide)
+
+
+@pytest.mark.parametrize("z_m", [0.5, 2.0, 6.0, 20.0])
+def test_a_pose_holds_only_inside_all_its_limits(z_m):
+    limit_m, limit_rad = alert_limit(z_m, 0.0)
+    assert pose_holds(bound_of(z_m))
+    assert not pose_holds(bound_of(z_m, lateral=limit_m))
+    assert not pose_holds(bound_of(z_m, axial=1.01 * limit_m))
+    assert not pose_holds(bound_of(z_m, angle=limit_rad))
+    assert not pose_holds(bound_of(z_m, axial=math.nan))
+    assert not pose_holds(bound_of(z_m, angle=math.inf))
+
+
+def test_a_guide_from_afar_has_its_own_limits():
+    assert guide_holds(bound_of(20.0, lateral=9.0, axial=9.0, angle=9.0))
+    assert guide_holds(bound_of(20.0, bearing=0.99 * math.radians(1.5), distance=1.8))
+    assert not guide_holds(bound_of(20.0, bearing=math.radians(1.5)))
+    assert not guide_holds(bound_of(20.0, distance=1.82))  # a tenth of the near end, 18.18 m
+    assert not guide_holds(bound_of(20.0, bearing=math.nan))
+    assert guide_holds(bound_of(3.2, distance=0.15))
+
+
+@pytest.mark.parametrize("angle", [0.01, 0.2])
+@pytest.mark.parametrize("z_m", [-2.5, 0.1, 1.0, 2.9])
+def test_a_guide_near_the_dock_holds_as_the_pose_does(z_m, angle):
+    bound = bound_of(z_m, angle=angle, bearing=9.0, distance=0.0)
+    assert guide_holds(bound) == pose_holds(bound) == (angle < math.radians(5))
+    # a far guide whose range may end near the dock is near
+    assert guide_holds(bound_of(3.5, angle=angle, distance=0.6)) == (angle < math.radians(5))
+
+
+@pytest.mark.parametrize(
+    ("lights", "stage"),
+    [((), None), ((0, 1, 2), "front"), ((7, 8), "rear"), ((0, 12), "transition"), (tuple(range(M)), "transition")],
+)
+def test_stage_is_what_the_pose_rests_on(lights, stage):
+    name = np.full(M, -1, np.int64)
+    name[list(lights)] = np.arange(len(lights))
+    assert integrity.stage(replace(belief(at(8.0), np.eye(6)), name=name), PLAN) == stage

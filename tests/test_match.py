@@ -1,0 +1,265 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import assert_close
+from numpy.testing import assert_array_equal
+from scipy.spatial.transform import Rotation
+
+from lumidock import match, verify
+from lumidock.camera import load_camera
+from lumidock.config import Config
+from lumidock.datatypes import Attitude, Detections
+from lumidock.geometry import se3_inverse
+from lumidock.pose import project_lights
+from lumidock.sim.scenario import load_scenario
+from lumidock.sim.spots import spot_frames
+from lumidock.station import load_station
+
+ROOT = Path(__file__).parents[1]
+STATION = load_station(ROOT / "stations" / "cage-2x2x5.yaml")
+CAMERA = load_camera(ROOT / "cameras" / "imx264-60deg.yaml")
+CONFIG = Config()
+PLAN = match.plan(STATION, CAMERA, CONFIG.match)
+M = len(STATION)
+HEAD_ON = np.diag([1.0, -1.0, -1.0])
+
+
+def acquire(detections, config=CONFIG):
+    found = match.spots(detections, PLAN, config.match)
+    return match.acquire(found, PLAN, CAMERA, match.prior(detections.attitude, config.prior), config.match)
+
+
+def answer(found):
+    return verify.is_answer(found, CONFIG.match)
+
+
+def true_names(light):
+    """The detection of each light (M,) from the light of each detection."""
+    name = np.full(M, -1, np.int64)
+    light = np.asarray(light)
+    name[light[light >= 0]] = np.flatnonzero(light >= 0)
+    return name
+
+
+def wrong(name, light):
+    """Names that are not the truth; a light that stays unnamed is none."""
+    return int(((name >= 0) & (name != true_names(light))).sum())
+
+
+def frames(scenario, *settings, seed=0):
+    return list(spot_frames(load_scenario(scenario, settings), STATION, CAMERA, seed))
+
+
+def shuffled(detections, order):
+    return replace(
+        detections,
+        **{key: getattr(detections, key)[order] for key in ("uv", "radius_px", "flux", "p_light", "p_rear")},
+    )
+
+
+def seen_from(T_dock_cam, lights, rng, *, noise_px=0.3, attitude=None):
+    uv = project_lights(CAMERA, T_dock_cam, STATION.p_dock[lights]) + rng.normal(0, noise_px, (len(lights), 2))
+    return replace(Detections.from_uv("f", 0, uv), attitude=attitude)
+
+
+def pose(R_dock_cam, t):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R_dock_cam, t
+    return T
+
+
+def test_a_clear_view_is_named_beyond_doubt(rng):
+    for frame in frames("missing-spurious", "path.count=25", "faults.missing=0", "faults.spurious=0"):
+        order = rng.permutation(len(frame.light))
+        found = acquire(shuffled(frame.detections, order))
+        assert found.margin > CONFIG.match.margin
+        assert answer(found)
+        head = found.candidates[0]
+        assert wrong(head.name, frame.light[order]) == 0
+        assert (head.name >= 0).sum() == 7
+        error = head.T_cam_dock @ frame.T_dock_cam
+        assert np.linalg.norm(error[:3, 3]) < 0.05 * frame.T_dock_cam[2, 3]
+
+
+def test_missing_and_spurious_lights_cost_no_wrong_name():
+    accepted = 0
+    for frame in frames("missing-spurious", "path.count=60", "faults.missing=3", "faults.spurious=3", seed=1):
+        found = acquire(frame.detections)
+        if answer(found):
+            accepted += 1
+            assert wrong(found.candidates[0].name, frame.light) == 0
+    assert accepted >= 55
+
+
+def test_the_order_of_detections_does_not_matter(rng):
+    for frame in frames("missing-spurious", "path.count=20", "faults.missing=2", "faults.spurious=3", seed=2):
+        order = rng.permutation(len(frame.light))
+        one, other = acquire(frame.detections), acquire(shuffled(frame.detections, order))
+        assert answer(one) == answer(other)
+        assert_close(other.margin, one.margin, atol=1e-3)
+        a, b = one.candidates[0].name, other.candidates[0].name
+        assert_array_equal(np.where(b >= 0, order[b], -1), a)
+
+
+def test_the_same_spots_give_the_same_bytes():
+    for frame in frames("joint", "path.count=5"):
+        one, other = acquire(frame.detections), acquire(frame.detections)
+        assert one.margin == other.margin
+        for a, b in zip(one.candidates, other.candidates, strict=True):
+            assert_array_equal(a.name, b.name)
+            assert_array_equal(a.T_cam_dock, b.T_cam_dock)
+            assert a.log_evidence == b.log_evidence
+
+
+def test_clutter_is_no_dock():
+    found = [acquire(frame.detections) for frame in frames("clutter", "path.count=40")]
+    assert not any(map(answer, found))
+
+
+def test_the_mirror_image_of_the_dock_is_no_dock():
+    seen = [frame.detections for frame in frames("mirror-only", "path.count=40")]
+    assert np.mean([len(detections) for detections in seen]) > 8
+    assert not any(answer(acquire(detections)) for detections in seen)
+
+
+@pytest.mark.parametrize("label", ["wrong", "absent"])
+def test_both_layers_are_named_without_their_colours(label):
+    settings = ["spots.wrong_layer=1.0"] if label == "wrong" else ["spots.wrong_layer=0.0", "spots.color=false"]
+    accepted = 0
+    for frame in frames("joint", "path.count=30", "spots.drop=0.0", *settings, seed=3):
+        found = acquire(frame.detections)
+        if answer(found):
+            accepted += 1
+            assert wrong(found.candidates[0].name, frame.light) == 0
+    assert accepted >= 25
+
+
+def test_a_right_colour_is_evidence_and_a_wrong_one_is_against():
+    def best(*settings):
+        seen = frames("joint", "path.count=10", "spots.drop=0.0", *settings, seed=4)
+        return np.array([acquire(frame.detections).candidates[0].log_evidence for frame in seen])
+
+    right = best("spots.wrong_layer=0.0")
+    assert (right > best("spots.wrong_layer=0.0", "spots.color=false")).all()
+    assert (right > best("spots.wrong_layer=1.0") + 3.0).all()
+
+
+@pytest.mark.parametrize("roll_deg", [-150, 75, 180])
+def test_a_measured_attitude_names_a_rolled_camera(roll_deg, rng):
+    lights, sigma = np.arange(7), np.deg2rad(2.0)
+    for z in (5.0, 10.0, 16.0):
+        turned = HEAD_ON @ Rotation.from_euler("z", roll_deg, degrees=True).as_matrix()
+        R_dock_cam = turned @ Rotation.from_rotvec(rng.uniform(-0.04, 0.04, 3)).as_matrix()
+        measured = R_dock_cam @ Rotation.from_rotvec(rng.normal(0, 0.5 * sigma, 3)).as_matrix()
+        truth = pose(R_dock_cam, [0.2, -0.3, z])
+        order = rng.permutation(7)
+        seen = seen_from(truth, lights[order], rng, attitude=Attitude(measured, sigma))
+        found = acquire(seen)
+        assert answer(found)
+        assert wrong(found.candidates[0].name, order) == 0
+        assert (found.candidates[0].name >= 0).sum() == 7
+        # the prior about head-on does not allow it: nothing, rather than another naming
+        without = acquire(replace(seen, attitude=None))
+        assert not answer(without)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_fewer_than_three_spots_are_too_few(n, rng):
+    found = acquire(seen_from(pose(HEAD_ON, [0, 0, 8.0]), np.arange(n), rng))
+    assert (found.candidates, found.flipped, found.reason) == ((), None, "too_few")
+    assert not answer(found)
+    assert (verify.names_of(found, CONFIG.match, M) == -1).all()
+
+
+def test_three_spots_alone_are_no_answer(rng):
+    for lights in ([0, 2, 6], [0, 4, 5], [7, 9, 11]):
+        assert not answer(acquire(seen_from(pose(HEAD_ON, [0, 0, 8.0]), np.array(lights), rng)))
+
+
+def test_spots_at_one_place_or_in_a_line_are_refused_quietly():
+    for uv in (np.full((6, 2), 700.0), np.stack([np.linspace(200, 2200, 7), np.full(7, 900.0)], axis=1)):
+        found = acquire(Detections.from_uv("f", 0, uv))
+        assert not answer(found)
+        assert np.isfinite(found.margin)
+
+
+def test_a_light_without_room_for_doubt_in_a_covariance_too(rng):
+    frame = frames("missing-spurious", "path.count=1", "faults.missing=0", "faults.spurious=0", seed=6)[0]
+    cov = np.repeat(np.array([[[0.4, 0.1], [0.1, 0.2]]]), len(frame.light), axis=0)
+    seen = match.spots(replace(frame.detections, cov_px2=cov), PLAN, CONFIG.match)
+    assert_array_equal(seen.cov, cov)
+    assert_close(seen.var, 0.3)
+    assert answer(acquire(replace(frame.detections, cov_px2=cov)))
+    without = match.spots(frame.detections, PLAN, CONFIG.match)
+    assert_close(without.cov, np.repeat(np.eye(2)[None], len(frame.light), axis=0) * CONFIG.match.noise_px**2)
+
+
+def test_likelihoods_are_of_the_right_layer():
+    detections = replace(Detections.from_uv("f", 0, np.eye(3, 2)), p_rear=np.array([0.95, 0.05, np.nan]))
+    like = match.spots(detections, PLAN, CONFIG.match).like
+    trusted = 0.5 + CONFIG.match.label_trust * 0.45
+    high, low = np.log(2 * trusted), np.log(2 * (1 - trusted))
+    assert_close(like, [[low, high], [high, low], [0.0, 0.0]])
+    assert_array_equal(PLAN.is_rear, [0, 1])
+
+
+def test_pairs_come_once_in_one_layer_and_count_down_what_is_unseen():
+    for lights in map(STATION.lights_of, STATION.layers):
+        mine = [tuple(sorted(pair)) for pair in PLAN.pairs.tolist() if pair[0] in lights]
+        assert len(mine) == len(set(mine)) == len(lights) * (len(lights) - 1) // 2
+        assert_array_equal(np.sort(PLAN.rank[lights]), np.arange(len(lights)))
+    assert (STATION.layer[PLAN.pairs[:, 0]] == STATION.layer[PLAN.pairs[:, 1]]).all()
+    assert (np.diff(PLAN.unseen) <= 0).all()
+    # by definition: the most lights of one layer, no two of which are a pair before
+    for k in (0, 5, 15, len(PLAN.pairs) - 1):
+        before = {frozenset(pair) for pair in PLAN.pairs[:k].tolist()}
+        most = 0
+        for bits in range(1 << 7):
+            for lights in map(STATION.lights_of, STATION.layers):
+                some = [int(c) for j, c in enumerate(lights) if bits >> j & 1]
+                if not any(frozenset((a, b)) in before for a in some for b in some if a < b):
+                    most = max(most, len(some))
+        assert PLAN.unseen[k] >= most
+
+
+def test_planes_of_the_layers_hold_their_lights():
+    for k, layer in enumerate(STATION.layers):
+        point, normal = PLAN.planes[k, :3], PLAN.planes[k, 3:]
+        assert_close(np.linalg.norm(normal), 1.0)
+        assert_close((STATION.p_dock[STATION.lights_of(layer)] - point) @ normal, 0.0)
+
+
+def test_the_best_pose_explains_its_names():
+    for frame in frames("joint", "path.count=10", seed=7):
+        found = acquire(frame.detections)
+        for candidate in found.candidates[:1]:
+            lights = np.flatnonzero(candidate.name >= 0)
+            uv = project_lights(CAMERA, se3_inverse(candidate.T_cam_dock), STATION.p_dock[lights])
+            off = uv - frame.detections.uv[candidate.name[lights]]
+            assert np.sqrt((off**2).mean()) < 1.5
+
+
+def test_light_of_is_the_inverse_of_a_naming(rng):
+    for _ in range(20):
+        n = 15
+        name = np.where(rng.random(M) < 0.5, rng.permutation(n)[:M], -1)
+        light = match.light_of(name, n)
+        assert_array_equal(true_names(light), name)
+        assert (light >= 0).sum() == (name >= 0).sum()
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "expected"),
+    [
+        ([0, 1, -1], [0, 1, 2], False),
+        ([0, 1, -1], [0, 2, -1], True),
+        ([0, 1, -1], [-1, -1, 1], True),
+        ([0, -1, -1], [-1, 1, -1], False),
+        ([-1, -1, -1], [0, 1, 2], False),
+    ],
+)
+def test_namings_contradict_where_a_light_or_a_spot_has_two(a, b, expected):
+    a, b = np.array(a), np.array(b)
+    assert verify.contradict(a, b) == verify.contradict(b, a) == expected
