@@ -165,6 +165,7 @@ def test_after_a_long_black_out_the_search_begins_anew():
     assert fixes[after - 1].reason == "no_lights"
     assert any(fix.status == "acquired" for fix in fixes[after : after + 3])
     assert any(fix.valid for fix in fixes[after : after + 3])
+    assert all(wrong_names(x, f.light) == 0 for f, x in zip(frames, fixes, strict=True))
 
 
 def test_a_stamp_that_does_not_follow_gives_no_fix():
@@ -279,12 +280,12 @@ def test_a_ring_of_one_layer_works_with_what_tells_its_roll(measured, rng):
     """A regular ring looks the same after an eighth of a turn: only the attitude names its lights."""
     station, sigma = ring(8), np.deg2rad(2.0)
     config = Config.model_validate({"prior": {"roll_deg": 4.0}})
-    localizer, valid = Localizer(station, CAMERA, config), 0
+    localizer, used = Localizer(station, CAMERA, config), 0
     roll = 100.0 if measured else 3.0
     R_dock_cam = HEAD_ON @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
     for k in range(30):
         T_dock_cam = np.eye(4)
-        T_dock_cam[:3, :3], T_dock_cam[:3, 3] = R_dock_cam, [0.3, -0.2, 8.0 - 0.03 * k]
+        T_dock_cam[:3, :3], T_dock_cam[:3, 3] = R_dock_cam, [0.3, -0.2, 12.0 - 0.03 * k]
         order = rng.permutation(8)
         uv = project_lights(CAMERA, T_dock_cam, station.p_dock[order]) + rng.normal(0, 0.3, (8, 2))
         noisy = R_dock_cam @ Rotation.from_rotvec(rng.normal(0, 0.001, 3)).as_matrix()
@@ -293,8 +294,8 @@ def test_a_ring_of_one_layer_works_with_what_tells_its_roll(measured, rng):
         require_sound(fix)
         require_true(fix, T_dock_cam)
         assert wrong_names(fix, order) == 0
-        valid += fix.valid or fix.guide is not None
-    assert valid >= 20
+        used += fix.valid or fix.guide is not None
+    assert used >= 25
 
 
 def test_a_ring_without_its_roll_is_not_named(rng):

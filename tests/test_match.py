@@ -185,7 +185,7 @@ def test_spots_at_one_place_or_in_a_line_are_refused_quietly():
         assert np.isfinite(found.margin)
 
 
-def test_a_light_without_room_for_doubt_in_a_covariance_too(rng):
+def test_centres_bring_their_covariance_or_get_the_configured_one():
     frame = frames("missing-spurious", "path.count=1", "faults.missing=0", "faults.spurious=0", seed=6)[0]
     cov = np.repeat(np.array([[[0.4, 0.1], [0.1, 0.2]]]), len(frame.light), axis=0)
     seen = match.spots(replace(frame.detections, cov_px2=cov), PLAN, CONFIG.match)

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
-from lumidock._kernels.lens import factor, inside, rotate_exp
+from lumidock._kernels.lens import factor, inside, invert6, rotate_exp
 from lumidock._kernels.pose import attitude_error, light_row
 from lumidock.datatypes import Array, Indices
 
@@ -527,13 +527,14 @@ def update(
         _flatten(R, t, plane, turn_cov, Rf, tf)
         if not _whiten(lens, Rf, tf, x, P, p, name, lights, m, cov, rows, cals, G, Z):
             return np.nan, np.nan
+    prior = P[:6, :6].copy()
     for r in range(2 * m):
         for i in range(n):
             g = G[r, i]
             end = n if i < estimated else estimated
             for j in range(end):
                 P[i, j] -= g * G[r, j]
-    rms = _separate(lens, R, t, Rf, tf, x, P, p, name, lights, m, uv, cov, apart)
+    rms = _separate(lens, R, t, Rf, tf, x, P, p, name, lights, m, uv, cov, estimated < n, prior, apart)
     return nis, rms
 
 
@@ -599,42 +600,91 @@ def _separate(
     m: int,
     uv: Array,
     cov: Array,
+    considered: bool,
+    before: Array,
     apart: Array,
 ) -> float:
-    """One-fault solution separation from the posterior: what leaving each light out would do. Returns rms residual px.
-
-    Jacobians are those at `Rf`, `tf`, which the covariance was updated with.
+    """One-fault solution separation: what leaving each light out would do. Returns rms residual px.
 
     Leaving rows H out of a linear estimate moves it by -P H^T (C - H P H^T)^-1 r and adds P H^T (C - H P H^T)^-1 H P.
+    Where the slow states are only `considered`, a light's survey error counts as its noise, and P is the pose's own
+    under the covariance `before` (6, 6). Jacobians are those at `Rf`, `tf`, which the covariance was updated with.
     """
     n = len(P)
-    h, cal, at, gu, gv = np.empty(14), np.empty(4), np.empty(3), np.empty(n), np.empty(n)
+    rows, cals, noise = np.empty((m, 14)), np.empty((m, 4)), np.empty((m, 3))
+    at, gu, gv, L, Q = np.empty(3), np.empty(n), np.empty(n), np.empty((6, 6)), np.empty((6, 6))
     apart[:] = 0.0
     total, C = 0.0, outputs(R, t)
+    N = np.empty((6, 6))
+    if considered and math.isnan(invert6(before, L, N)):
+        return np.nan
     for k in range(m):
         c, i = lights[k], name[lights[k]]
-        if not _row(lens, R, t, x, p, c, at, h, cal):
+        if not _row(lens, R, t, x, p, c, at, rows[k], cals[k]):
             return np.nan
-        ru, rv = uv[i, 0] - h[0], uv[i, 1] - h[1]
-        _row(lens, Rf, tf, x, p, c, at, h, cal)
-        _gains(P, h, cal, c, gu, gv)
-        a = cov[i, 0, 0] - _dot_row(gu, h, 2, cal[0], CALIBRATION + 1, c)
-        b = cov[i, 1, 0] - _dot_row(gv, h, 2, cal[0], CALIBRATION + 1, c)
-        d = cov[i, 1, 1] - _dot_row(gv, h, 8, cal[1], CALIBRATION + 2, c)
+        ru, rv = uv[i, 0] - rows[k, 0], uv[i, 1] - rows[k, 1]
+        _row(lens, Rf, tf, x, p, c, at, rows[k], cals[k])
+        rows[k, 0], rows[k, 1] = ru, rv
         total += ru * ru + rv * rv
+        noise[k, 0], noise[k, 1], noise[k, 2] = cov[i, 0, 0], cov[i, 1, 0], cov[i, 1, 1]
+        if considered:
+            _add_survey(P, rows[k], c, noise[k])
+            _add_information(rows[k], noise[k], N)
+    if considered and math.isnan(invert6(N, L, Q)):
+        return np.nan
+    for k in range(m):
+        c, h, cal = lights[k], rows[k], cals[k]
+        if considered:
+            for j in range(6):
+                gu[j] = gv[j] = 0.0
+                for o in range(6):
+                    gu[j] += Q[j, o] * h[2 + o]
+                    gv[j] += Q[j, o] * h[8 + o]
+            a, b, d = noise[k, 0], noise[k, 1], noise[k, 2]
+            for j in range(6):
+                a -= h[2 + j] * gu[j]
+                b -= h[2 + j] * gv[j]
+                d -= h[8 + j] * gv[j]
+        else:
+            _gains(P, h, cal, c, gu, gv)
+            a = noise[k, 0] - _dot_row(gu, h, 2, cal[0], CALIBRATION + 1, c)
+            b = noise[k, 1] - _dot_row(gv, h, 2, cal[0], CALIBRATION + 1, c)
+            d = noise[k, 2] - _dot_row(gv, h, 8, cal[1], CALIBRATION + 2, c)
         det = a * d - b * b
-        if not (a > 1e-6 * cov[i, 0, 0] and d > 1e-6 * cov[i, 1, 1] and det > 1e-6 * cov[i, 0, 0] * cov[i, 1, 1]):
+        if not (a > 1e-6 * noise[k, 0] and d > 1e-6 * noise[k, 2] and det > 1e-6 * noise[k, 0] * noise[k, 2]):
             apart[c, 9:] = np.inf
             continue
-        su, sv = (d * ru - b * rv) / det, (a * rv - b * ru) / det
+        su, sv = (d * h[0] - b * h[1]) / det, (a * h[1] - b * h[0]) / det
         for j in range(9):
             ou, ov = 0.0, 0.0
-            for k2 in range(6):
-                ou += C[j, k2] * gu[k2]
-                ov += C[j, k2] * gv[k2]
+            for o in range(6):
+                ou += C[j, o] * gu[o]
+                ov += C[j, o] * gv[o]
             apart[c, j] = -(ou * su + ov * sv)
             apart[c, 9 + j] = (d * ou * ou - 2.0 * b * ou * ov + a * ov * ov) / det
     return math.sqrt(total / (2.0 * m)) if m else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _add_survey(P: Array, h: Array, c: int, noise: Array) -> None:
+    """Add what the survey error of light `c` makes of its pixel to `noise` (3,) uu, uv, vv."""
+    base = LIGHTS + 3 * c
+    for i in range(3):
+        for j in range(3):
+            s = P[base + i, base + j]
+            noise[0] += h[2 + i] * s * h[2 + j]
+            noise[1] += h[2 + i] * s * h[8 + j]
+            noise[2] += h[8 + i] * s * h[8 + j]
+
+
+@njit(cache=True, error_model="numpy")
+def _add_information(h: Array, noise: Array, N: Array) -> None:
+    """Add one pixel's information about the pose to `N` (6, 6)."""
+    det = noise[0] * noise[2] - noise[1] * noise[1]
+    a, b, d = noise[2] / det, -noise[1] / det, noise[0] / det
+    for i in range(6):
+        for j in range(6):
+            N[i, j] += h[2 + i] * (a * h[2 + j] + b * h[8 + j]) + h[8 + i] * (b * h[2 + j] + d * h[8 + j])
 
 
 @njit(cache=True, error_model="numpy")
