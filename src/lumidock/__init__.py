@@ -2,24 +2,29 @@
 
 from lumidock.camera import Camera, load_camera
 from lumidock.config import Config, PaperConfig, load_config
-from lumidock.datatypes import Detections, Fix, Frame, LayerPose, Match
+from lumidock.datatypes import Attitude, Detections, Fix, Frame, Guide, LayerPose, Match, Protection
 from lumidock.errors import FrameError, InputError, LumidockError
+from lumidock.localizer import Localizer
 from lumidock.paper import PaperLocalizer
 from lumidock.station import Station, load_station
 
 __all__ = [
+    "Attitude",
     "Camera",
     "Config",
     "Detections",
     "Fix",
     "Frame",
     "FrameError",
+    "Guide",
     "InputError",
     "LayerPose",
+    "Localizer",
     "LumidockError",
     "Match",
     "PaperConfig",
     "PaperLocalizer",
+    "Protection",
     "Station",
     "load_camera",
     "load_config",

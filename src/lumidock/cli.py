@@ -306,8 +306,8 @@ def _demo(
 ) -> None:
     """Simulate a docking, run it, and leave files and pictures."""
     from lumidock.demo import Album, summary_lines
+    from lumidock.localizer import Localizer
     from lumidock.metrics import evaluate, true_poses
-    from lumidock.paper import PaperLocalizer
     from lumidock.report import contact_sheet, plot_trajectory
     from lumidock.run import Setup
     from lumidock.run import run as run_source
@@ -328,7 +328,7 @@ def _demo(
     with _progress("simulating") as progress:
         write_rendered(scenario, dock, lens, seed, sequence, progress=progress)
     source = open_source(sequence)
-    setup = Setup("paper", False, Config(), station_file, camera_file)
+    setup = Setup("lumidock", False, Config(), station_file, camera_file)
     video = out / "annotated.mp4"
     with (
         RunFolder(run_folder, dock.ids) as folder,
@@ -344,7 +344,7 @@ def _demo(
 
         _copy(station_file, run_folder / "station.yaml")
         _copy(camera_file, run_folder / "camera.yaml")
-        summary = run_source(source, PaperLocalizer(dock, lens), folder, setup, on_fix=on_fix)
+        summary = run_source(source, Localizer(dock, lens), folder, setup, on_fix=on_fix)
     result = evaluate(run_folder, sequence)
     plot_trajectory(album.fixes, true_poses(sequence), dock, out / "trajectory.png")
     contact_sheet(album.sheet(), out / "stages.jpg")

@@ -51,9 +51,12 @@ class Album:
             codec = cv2.VideoWriter.fourcc(*"mp4v")
             self._writer = cv2.VideoWriter(str(self.video), codec, self.fps, (picture.shape[1], picture.shape[0]))
         self._writer.write(picture)
-        if fix.valid and sum(f.valid and f.stage == fix.stage for f in self.fixes) <= _PICTURE_OF_STAGE[fix.stage]:
-            near = around_lights(item.image, fix, _WIDTH)
-            self.by_stage[fix.stage] = draw(item.image, fix, self.station, self.camera, near)
+        usable = [one.stage for one in self.fixes if _is_usable(one)]
+        if not _is_usable(fix) or usable.count(fix.stage) > _PICTURE_OF_STAGE[fix.stage]:
+            return
+        near = around_lights(item.image, fix, _WIDTH)
+        slot = "search" if len(usable) == 1 else fix.stage  # the very first one ends the search
+        self.by_stage[slot] = draw(item.image, fix, self.station, self.camera, near)
 
     def sheet(self) -> list[Image]:
         """One picture per stage, in the order of the approach; an even number of them."""
@@ -61,22 +64,23 @@ class Album:
         return pictures[len(pictures) % 2 :]
 
 
+def _is_usable(fix: Fix) -> bool:
+    """Whether a vehicle may do something with it."""
+    return fix.valid or fix.guide is not None
+
+
 def summary_lines(result: dict[str, Any], counts: dict[str, Any]) -> list[str]:
     """Five lines about a run against its truth."""
-    error, layers, labels = result["error"], result.get("layers", {}), result.get("labels", {})
-    front, rear = layers.get("front", {}), layers.get("rear", {})
-
-    def reach(layer: dict[str, Any]) -> str:
-        return f"{layer['first_z_m']:.2f} m to {layer['last_z_m']:.2f} m" if layer else "none"
-
+    error, labels = result["error"], result.get("labels", {})
+    hazards = result["hazardous"]
     gap = result["longest_gap_s"]
     latency = counts["latency_us"].get("p50", np.nan) / 1000.0
     return [
         f"fixes       {result['valid']} of {result['frames']} frames, longest gap {gap:.2f} s"
         if gap
         else "fixes       none",
-        f"front layer {reach(front)}",
-        f"rear layer  {reach(rear)}",
+        f"guidance    {result.get('guide', 0)} of {result['frames']} frames (bearing and range)",
+        f"hazardous   {hazards['valid']['any']} poses, {hazards['guide']['any']} guides over their alert limit",
         f"error       median {error['lateral_m']['median']:.3f} m lateral, {error['axial_m']['median']:.3f} m axial, "
         f"{error['angle_deg']['median']:.2f} deg; wrong names {labels.get('wrong', 0)} of {labels.get('named', 0)}"
         if error

@@ -19,6 +19,7 @@ from lumidock.track import Track
 _NEAR_LIMITS = ((1.5, 0.3, 5.0), (5.0, 0.5, 5.0), (12.0, 1.0, 8.0))
 _FAR_SHARE, _FAR_DEG = 0.10, 10.0  # beyond: a share of z, and degrees
 GUIDE_BEARING_RAD, GUIDE_RANGE_M, GUIDE_RANGE_SHARE = math.radians(1.5), 0.3, 0.10
+_ANY_BEARING = math.sqrt(2.0) * math.pi  # at the origin itself a bearing says nothing
 GUIDE_FROM_M = 3.0  # nearer to the dock's origin, or past it, bearing and range say nothing and the pose decides
 
 
@@ -69,12 +70,19 @@ def bounds(beliefs: Sequence[Track], config: IntegrityConfig) -> Bounds:
     T_dock_cam = np.eye(4)
     T_dock_cam[:3, :3], T_dock_cam[:3, 3] = first.R.T, -(first.R.T @ first.t)
     x, y, z = first.t.tolist()
+    reach = math.sqrt(x * x + y * y + z * z)
     lateral, axial, angle, bearing, distance = pl.tolist()
     return Bounds(
         T_dock_cam,
         cov[:6, :6],
         Protection(lateral, axial, angle),
-        Guide(math.atan2(x, z), math.atan2(y, z), math.sqrt(x * x + y * y + z * z), bearing, distance),
+        Guide(
+            math.atan2(x, z),
+            math.atan2(y, z),
+            reach,
+            bearing if reach > distance else max(bearing, _ANY_BEARING),
+            distance,
+        ),
     )
 
 
@@ -123,9 +131,8 @@ def _apart(a: Track, b: Track) -> Array:
     """How far two poses lie apart in what the levels bound: lateral, axial, angle, bearing, range (5,)."""
     at = -(a.R.T @ a.t) + b.R.T @ b.t
     turn = math.acos(min(max(0.5 * (float(np.trace(a.R.T @ b.R)) - 1.0), -1.0), 1.0))
-    bearing = math.hypot(
-        math.atan2(a.t[0], a.t[2]) - math.atan2(b.t[0], b.t[2]), math.atan2(a.t[1], a.t[2]) - math.atan2(b.t[1], b.t[2])
-    )
+    between = [math.atan2(a.t[k], a.t[2]) - math.atan2(b.t[k], b.t[2]) for k in (0, 1)]
+    bearing = math.hypot(*(math.remainder(angle, 2.0 * math.pi) for angle in between))
     distance = abs(float(np.linalg.norm(a.t) - np.linalg.norm(b.t)))
     return np.array([math.hypot(at[0], at[1]), abs(at[2]), turn, bearing, distance])
 

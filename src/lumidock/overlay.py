@@ -96,11 +96,15 @@ def _draw_caption(canvas: np.ndarray, fix: Fix) -> None:
         _TEXT,
         0.62,
     )
-    if fix.T_dock_cam is None:
-        _put(canvas, f"no fix: {fix.reason}", (14, 56), _SPURIOUS, 0.62)
-    else:
+    if fix.T_dock_cam is not None:
         x, y, z = fix.T_dock_cam[:3, 3]
         _put(canvas, f"x {x:+.2f}   y {y:+.2f}   z {z:+.2f} m", (14, 56), _TEXT, 0.62)
+    elif fix.guide is not None:
+        x, y = np.rad2deg([fix.guide.bearing_x_rad, fix.guide.bearing_y_rad])
+        text = f"bearing {x:+.2f}, {y:+.2f} deg   range {fix.guide.range_m:.2f} m   no pose: {fix.reason}"
+        _put(canvas, text, (14, 56), _TEXT, 0.62)
+    else:
+        _put(canvas, f"no fix: {fix.reason}", (14, 56), _SPURIOUS, 0.62)
 
 
 def _put(canvas: np.ndarray, text: str, at: tuple[int, int], color: tuple[int, int, int], size: float) -> None:

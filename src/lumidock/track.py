@@ -236,7 +236,7 @@ def update(
     R0, t0, x, P = track.R, track.t, track.x.copy(), track.P.copy()
     R, t = (track.R.copy(), track.t.copy()) if at is None else (at[:3, :3].copy(), at[:3, 3].copy())
     apart, plane = np.zeros((len(name), 18)), _plane(name, plan, joint=track.joint)
-    nis, _ = kernel.update(
+    nis = kernel.update(
         plan.lens,
         R0,
         t0,

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
-from lumidock._kernels.lens import factor, inside, invert6, rotate_exp
+from lumidock._kernels.lens import factor, inside, rotate_exp
 from lumidock._kernels.pose import attitude_error, light_row
 from lumidock.datatypes import Array, Indices
 
@@ -462,8 +462,8 @@ def update(
     turn_cov: Array,
     tracking: bool,
     apart: Array,
-) -> tuple[float, float]:
-    """Take in the named pixels, all in one, relinearised up to `steps` times; in place. Returns NIS and rms residual.
+) -> float:
+    """Take in the named pixels, all in one, relinearised up to `steps` times; in place. Returns the NIS.
 
     `R0`, `t0` are the mean that `P` belongs to, `R`, `t` where to linearise first. Where the lights are one `plane`
     (6,) (a point and the normal; NaN: none), the covariance is that of the flattest view within three sigmas of tilt by
@@ -492,12 +492,12 @@ def update(
         if not plain and tracking:
             _flatten(R, t, plane, turn_cov, Rf, tf)
         if not _whiten(lens, Rf, tf, x, P, p, name, lights, m, cov, rows, cals, G, Z):
-            return np.nan, np.nan
+            return np.nan
         for k in range(m):
             i = name[lights[k]]
             if not plain and tracking:
                 if not _row(lens, R, t, x, p, lights[k], at, h, cal):
-                    return np.nan, np.nan
+                    return np.nan
                 rows[k, 0], rows[k, 1] = h[0], h[1]
             nu[2 * k] = uv[i, 0] - rows[k, 0] + _dot_row(dx, rows[k], 2, cals[k, 0], CALIBRATION + 1, lights[k])
             nu[2 * k + 1] = uv[i, 1] - rows[k, 1] + _dot_row(dx, rows[k], 8, cals[k, 1], CALIBRATION + 2, lights[k])
@@ -526,16 +526,20 @@ def update(
     if not plain:
         _flatten(R, t, plane, turn_cov, Rf, tf)
         if not _whiten(lens, Rf, tf, x, P, p, name, lights, m, cov, rows, cals, G, Z):
-            return np.nan, np.nan
-    prior = P[:6, :6].copy()
+            return np.nan
+        for r in range(2 * m):
+            s = nu[r]
+            for k in range(r):
+                s -= Z[r, k] * w[k]
+            w[r] = s / Z[r, r]
     for r in range(2 * m):
         for i in range(n):
             g = G[r, i]
             end = n if i < estimated else estimated
             for j in range(end):
                 P[i, j] -= g * G[r, j]
-    rms = _separate(lens, R, t, Rf, tf, x, P, p, name, lights, m, uv, cov, estimated < n, prior, apart)
-    return nis, rms
+    _separate(Z, G, w, outputs(R, t), lights, m, apart)
+    return nis
 
 
 @njit(cache=True, error_model="numpy")
@@ -555,7 +559,7 @@ def _whiten(
     G: Array,
     Z: Array,
 ) -> bool:
-    """Fill `rows` and `cals` of `m` named lights, `Z`, the factor L of their innovation's covariance, and `G`, L^-1 H P.
+    """Fill `rows`, `cals` of `m` named lights, `Z`, the factor L of their innovation's covariance, and `G`, L^-1 H P.
 
     False where a light is out of the lens's sight.
     """
@@ -586,105 +590,43 @@ def _whiten(
 
 
 @njit(cache=True, error_model="numpy")
-def _separate(
-    lens: Array,
-    R: Array,
-    t: Array,
-    Rf: Array,
-    tf: Array,
-    x: Array,
-    P: Array,
-    p: Array,
-    name: Indices,
-    lights: Indices,
-    m: int,
-    uv: Array,
-    cov: Array,
-    considered: bool,
-    before: Array,
-    apart: Array,
-) -> float:
-    """One-fault solution separation: what leaving each light out would do. Returns rms residual px.
+def _separate(Z: Array, G: Array, w: Array, C: Array, lights: Indices, m: int, apart: Array) -> None:
+    """One-fault solution separation: what leaving each of `m` lights out of the update would do to the outputs `C`.
 
-    Leaving rows H out of a linear estimate moves it by -P H^T (C - H P H^T)^-1 r and adds P H^T (C - H P H^T)^-1 H P.
-    Where the slow states are only `considered`, a light's survey error counts as its noise, and P is the pose's own
-    under the covariance `before` (6, 6). Jacobians are those at `Rf`, `tf`, which the covariance was updated with.
+    With S = L L^T the innovation's covariance (`Z`), `G` = L^-1 H P, `w` = L^-1 nu and V the columns of L^-1 that
+    belong to a light's two rows, leaving them out moves the state by -G^T V (V^T V)^-1 V^T w and adds the variance
+    G^T V (V^T V)^-1 V^T G: block elimination, exact also where states are only considered.
     """
-    n = len(P)
-    rows, cals, noise = np.empty((m, 14)), np.empty((m, 4)), np.empty((m, 3))
-    at, gu, gv, L, Q = np.empty(3), np.empty(n), np.empty(n), np.empty((6, 6)), np.empty((6, 6))
+    V, U = np.empty((2 * m, 2)), np.empty((9, 2))
     apart[:] = 0.0
-    total, C = 0.0, outputs(R, t)
-    N = np.empty((6, 6))
-    if considered and math.isnan(invert6(before, L, N)):
-        return np.nan
     for k in range(m):
-        c, i = lights[k], name[lights[k]]
-        if not _row(lens, R, t, x, p, c, at, rows[k], cals[k]):
-            return np.nan
-        ru, rv = uv[i, 0] - rows[k, 0], uv[i, 1] - rows[k, 1]
-        _row(lens, Rf, tf, x, p, c, at, rows[k], cals[k])
-        rows[k, 0], rows[k, 1] = ru, rv
-        total += ru * ru + rv * rv
-        noise[k, 0], noise[k, 1], noise[k, 2] = cov[i, 0, 0], cov[i, 1, 0], cov[i, 1, 1]
-        if considered:
-            _add_survey(P, rows[k], c, noise[k])
-            _add_information(rows[k], noise[k], N)
-    if considered and math.isnan(invert6(N, L, Q)):
-        return np.nan
-    for k in range(m):
-        c, h, cal = lights[k], rows[k], cals[k]
-        if considered:
-            for j in range(6):
-                gu[j] = gv[j] = 0.0
-                for o in range(6):
-                    gu[j] += Q[j, o] * h[2 + o]
-                    gv[j] += Q[j, o] * h[8 + o]
-            a, b, d = noise[k, 0], noise[k, 1], noise[k, 2]
-            for j in range(6):
-                a -= h[2 + j] * gu[j]
-                b -= h[2 + j] * gv[j]
-                d -= h[8 + j] * gv[j]
-        else:
-            _gains(P, h, cal, c, gu, gv)
-            a = noise[k, 0] - _dot_row(gu, h, 2, cal[0], CALIBRATION + 1, c)
-            b = noise[k, 1] - _dot_row(gv, h, 2, cal[0], CALIBRATION + 1, c)
-            d = noise[k, 2] - _dot_row(gv, h, 8, cal[1], CALIBRATION + 2, c)
+        a = b = d = wu = wv = 0.0
+        for r in range(2 * k, 2 * m):
+            for o in range(2):
+                s = 1.0 if r == 2 * k + o else 0.0
+                for q in range(2 * k, r):
+                    s -= Z[r, q] * V[q, o]
+                V[r, o] = s / Z[r, r]
+            a += V[r, 0] * V[r, 0]
+            b += V[r, 0] * V[r, 1]
+            d += V[r, 1] * V[r, 1]
+            wu += V[r, 0] * w[r]
+            wv += V[r, 1] * w[r]
         det = a * d - b * b
-        if not (a > 1e-6 * noise[k, 0] and d > 1e-6 * noise[k, 2] and det > 1e-6 * noise[k, 0] * noise[k, 2]):
-            apart[c, 9:] = np.inf
-            continue
-        su, sv = (d * h[0] - b * h[1]) / det, (a * h[1] - b * h[0]) / det
         for j in range(9):
-            ou, ov = 0.0, 0.0
+            U[j, 0] = U[j, 1] = 0.0
             for o in range(6):
-                ou += C[j, o] * gu[o]
-                ov += C[j, o] * gv[o]
-            apart[c, j] = -(ou * su + ov * sv)
-            apart[c, 9 + j] = (d * ou * ou - 2.0 * b * ou * ov + a * ov * ov) / det
-    return math.sqrt(total / (2.0 * m)) if m else 0.0
-
-
-@njit(cache=True, error_model="numpy")
-def _add_survey(P: Array, h: Array, c: int, noise: Array) -> None:
-    """Add what the survey error of light `c` makes of its pixel to `noise` (3,) uu, uv, vv."""
-    base = LIGHTS + 3 * c
-    for i in range(3):
-        for j in range(3):
-            s = P[base + i, base + j]
-            noise[0] += h[2 + i] * s * h[2 + j]
-            noise[1] += h[2 + i] * s * h[8 + j]
-            noise[2] += h[8 + i] * s * h[8 + j]
-
-
-@njit(cache=True, error_model="numpy")
-def _add_information(h: Array, noise: Array, N: Array) -> None:
-    """Add one pixel's information about the pose to `N` (6, 6)."""
-    det = noise[0] * noise[2] - noise[1] * noise[1]
-    a, b, d = noise[2] / det, -noise[1] / det, noise[0] / det
-    for i in range(6):
-        for j in range(6):
-            N[i, j] += h[2 + i] * (a * h[2 + j] + b * h[8 + j]) + h[8 + i] * (b * h[2 + j] + d * h[8 + j])
+                gu = gv = 0.0
+                for r in range(2 * k, 2 * m):
+                    gu += G[r, o] * V[r, 0]
+                    gv += G[r, o] * V[r, 1]
+                U[j, 0] += C[j, o] * gu
+                U[j, 1] += C[j, o] * gv
+        c = lights[k]
+        for j in range(9):
+            u, v = (d * U[j, 0] - b * U[j, 1]) / det, (a * U[j, 1] - b * U[j, 0]) / det
+            apart[c, j] = -(u * wu + v * wv)
+            apart[c, 9 + j] = u * U[j, 0] + v * U[j, 1]
 
 
 @njit(cache=True, error_model="numpy")
