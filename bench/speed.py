@@ -99,12 +99,13 @@ def main() -> tuple[dict[str, object], list[str]]:
         cells = (np.array([timing[stage] for timing in rounds[z]]) for z in _Z_M)
         lines.append(f"| {stage} | " + " | ".join(f"{np.median(c):.2f} ({c.max():.2f})" for c in cells) + " |")
     peak = _peak_mib([frame for group in pictures.values() for frame in group])
-    lines += ["", f"Peak memory of a run: {peak:.0f} MiB. {_machine()}"]
-    content = {"rounds": {str(z): timings for z, timings in rounds.items()}, "peak_mib": peak, "machine": _machine()}
+    lines += ["", f"Peak memory of a run: {peak:.0f} MiB. {machine()}"]
+    content = {"rounds": {str(z): timings for z, timings in rounds.items()}, "peak_mib": peak, "machine": machine()}
     return content, lines
 
 
-def _machine() -> str:
+def machine() -> str:
+    """What the figures were measured on."""
     model = next(
         (line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line),
         platform.machine(),

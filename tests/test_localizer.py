@@ -220,7 +220,7 @@ def test_too_many_spots_are_refused(rng):
     fix = localizer.process_detections(replace(crowd, t_ns=seen[4].t_ns + 1))
     assert (fix.reason, fix.status) == ("too_many", "coasting")
     # the gap widened the gates; at the latest the second frame after it is whole again
-    assert any([localizer.process_detections(replace(d, t_ns=d.t_ns + 1)).valid for d in seen[5:7]])
+    assert any(localizer.process_detections(replace(d, t_ns=d.t_ns + 1)).valid for d in seen[5:7])
 
 
 @pytest.mark.parametrize(("n", "reason"), [(0, "no_lights"), (1, "too_few"), (2, "too_few")])
