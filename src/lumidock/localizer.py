@@ -83,6 +83,8 @@ class Localizer:
         ):
             self.beliefs = followed
             return self._conclude(detections, "tracking")
+        if held:  # what the track has learned while it overlooked a layer is in doubt too
+            self.locked, self._slow = False, None
         if verify.is_answer(found, self.config.match) and self._lock(found, detections, seen):
             return self._conclude(detections, "acquired")
         if self.locked:
@@ -135,8 +137,12 @@ class Localizer:
         return enough and explains and verify.innovation_holds(belief, self.config.track)
 
     def _overlooks(self, belief: Track, seen: Spots) -> bool:
-        """Whether a second layer may have come into view where the tilt was too open to expect it."""
-        return not belief.joint and self._plan.n_layers > 1 and len(seen.uv) - belief.n_used >= _MIN_SOLID
+        """Whether a second layer may be in view where the tilt was too open, or too wrong, to expect it there."""
+        if self._plan.n_layers == 1 or len(seen.uv) - belief.n_used < _MIN_SOLID:
+            return False
+        lately = belief.layer_ns > belief.t_ns - self.config.track.max_gap_s * 1e9
+        named = np.bincount(self._plan.layer[belief.name >= 0], minlength=self._plan.n_layers) > 0
+        return not belief.joint or bool((lately & ~named).any())
 
     def _acquire(self, detections: Detections, seen: Spots) -> Acquisition:
         expected = match.prior(detections.attitude, self.config.prior)
