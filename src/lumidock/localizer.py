@@ -184,8 +184,8 @@ class Localizer:
         self.beliefs = self._likeliest([*others, *(belief for belief in begun if belief is not None)])
         if found.reason == "mirror" or not self.beliefs or not verify.gathered(self.beliefs, found, self.config):
             return False
-        self.locked, self.margin = True, 0.0
-        return verify.innovation_holds(self.beliefs[0], self.config.track)
+        self.locked, self.margin = verify.innovation_holds(self.beliefs[0], self.config.track), 0.0
+        return self.locked
 
     def _renew(
         self,
@@ -231,8 +231,10 @@ class Localizer:
         nothing = np.full(len(self.station), -1, np.int64)
         self.beliefs = [replace(b, name=nothing, proof=0 if reason == "residual" else b.proof) for b in self.beliefs]
         age_s = (detections.t_ns - self.beliefs[0].lights_ns) * 1e-9
-        if reason == "residual" or age_s > self.config.integrity.max_age_s:
-            return self._no_fix(detections, "coasting", "residual" if reason == "residual" else "stale")
+        if self.beliefs[0].proof == 0:  # nothing has agreed since a test failed
+            return self._no_fix(detections, "coasting", "residual")
+        if age_s > self.config.integrity.max_age_s:
+            return self._no_fix(detections, "coasting", "stale")
         return self._conclude(detections, "coasting")
 
     def _refuse(self, detections: Detections) -> str:

@@ -32,10 +32,10 @@ class Track:
 
     `R`, `t` of T_cam_dock; `x` (n,) twist and slow states, `P` (n, n) their covariance with the pose's (order in
     `_kernels.track`). `joint`: slow states are being estimated. `log_weight`: log evidence since the track began.
-    `proof` counts frames that four or more lights agreed in. `name` (M,) the detection of each light in
-    that frame, `apart` (M, 18) what leaving one out would do, `plane` (6,) the one that all
-    of them lie on (NaN: none), `nis` its normalised innovation squared, `surprise` the
-    same as a standard normal deviate, and `strain` the running mean of that over frames, as a deviate too.
+    `proof`: frames since the last failed test in which four lights agreed. `lights_ns`, `layer_ns` (L,): when any
+    light and when each layer was seen last. Of the last frame: `name` (M,) the detection of each light, `apart` (M, 18)
+    what leaving one out would do, `plane` (6,) the one that all lie on (NaN: none), `nis` the normalised innovation
+    squared, `surprise` the same as a normal deviate, and `strain` the running mean of that over frames.
     """
 
     t_ns: int
@@ -156,6 +156,9 @@ def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
 def attend(track: Track, attitude: Attitude) -> Track:
     """The track with the vehicle's own attitude taken in."""
     R, t, x, P = track.R.copy(), track.t.copy(), track.x.copy(), track.P.copy()
+    bias = slice(kernel.BIAS, kernel.CALIBRATION)
+    if P[kernel.BIAS, kernel.BIAS] == 0.0:  # the track began without a sensor: its bias is as open as ever
+        P[bias, bias] = np.eye(3) * attitude.sigma_rad**2
     var = np.full(3, attitude.sigma_rad**2)
     kernel.attitude_update(R, t, x, P, np.ascontiguousarray(attitude.R_dock_cam), var, True)
     return replace(track, R=R, t=t, x=x, P=P)
