@@ -192,11 +192,13 @@ class MatchConfig(Section):
     clutter_near: Fraction = 0.02  # share of spurious spots that stand as close as the detections do
     clutter_margin_px: PositiveFloat = 100.0
     gate: PositiveFloat = 18.4  # chi-square, 2 dof, 1e-4
+    pair_gate: PositiveFloat = 11.8  # of a light that two others and the attitude prior place; 2 dof, 0.3 %
     bend: PositiveFloat = 0.7  # a tilt of variance s foreshortens by this times s, 1 sigma
     roll_gate: PositiveFloat = 3.3  # sigma of the prior
     near_m: PositiveFloat = 0.3
     far_m: PositiveFloat = 40.0  # of a light
     hypotheses: PositiveInt = 64
+    max_pairs: PositiveInt = 40_000  # pairs looked at in a frame, some 1.5 us each; a frame that wants more is refused
     log_dock: float = 2.0  # log prior odds that the dock is in view at all
     max_spots_three: PositiveInt = 14  # among more, three lights of a layer say nothing
     sure: PositiveFloat = 15.0  # log evidence above which three lights of each layer need not be looked for

@@ -13,7 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lumidock._kernels import match as kernel
+from lumidock._kernels import evidence as kernel
+from lumidock._kernels.evidence import Expected, Lights, Seen
+from lumidock._kernels.rivals import other_pose, rivals
+from lumidock._kernels.search import Best, Goal, Listed, search
 from lumidock.camera import Camera
 from lumidock.config import MatchConfig, PriorConfig
 from lumidock.datatypes import Array, Attitude, Detections, Indices
@@ -30,16 +33,16 @@ _FLAT = 0.05  # a layer less thick than this share of its width is a plane
 class Plan:
     """A station as the search wants it: M lights, the order in which pairs are tried, and what is unseen before each.
 
-    `survey_m2` (M,) variance of a light's position; `rank` (M,) within its layer; `unseen` (S,) the most lights of one
-    layer in a naming without the pairs before.
+    `unseen` (S,) is the most lights of one layer in a naming without the pairs before; `mirrored` are the lights as the
+    water's surface shows them.
     """
 
     lens: Array
     p_dock: Array
     layer: Indices
     axis: Array
-    survey_m2: Array
-    rank: Indices
+    direct: Lights
+    mirrored: Lights
     pairs: Indices
     unseen: Indices
     n_layers: int
@@ -93,13 +96,14 @@ def plan(station: Station, camera: Camera, config: MatchConfig) -> Plan:
     size = np.array([camera.width, camera.height]) / camera.focal_px
     volume = float(size.prod()) * config.far_m**3 / 3.0
     is_rear = (behind == len(front_first) - 1).astype(np.int64)
+    direct = Lights(camera.lens(), np.ascontiguousarray(station.p_dock), station.layer, station.axis, survey_m2, rank)
     return Plan(
-        camera.lens(),
-        np.ascontiguousarray(station.p_dock),
+        direct.lens,
+        direct.p,
         station.layer,
         station.axis,
-        survey_m2,
-        rank,
+        direct,
+        direct._replace(p=direct.p * _MIRROR, axis=direct.axis * _MIRROR),
         pairs,
         unseen,
         len(station.layers),
@@ -197,118 +201,69 @@ def _log_clutter(found: Spots) -> Array:
 
 
 def _parameters(plan: Plan, config: MatchConfig, tilt_var: float, roll_sigma: float, *, mixed: bool) -> Array:
-    q = np.empty(10)
+    q = np.empty(11)
     q[kernel.LOG_VOLUME] = plan.log_volume
     q[kernel.DETECT], q[kernel.ABSENT] = config.detect, config.layer_absent
     q[kernel.GATE], q[kernel.NEAR_M], q[kernel.FAR_M] = config.gate, config.near_m, config.far_m
+    q[kernel.PAIR_GATE] = config.pair_gate
     q[kernel.ROLL_GATE] = min(config.roll_gate * roll_sigma, math.pi)
     q[kernel.BEND] = (config.bend * tilt_var) ** 2
     q[kernel.STEADY], q[kernel.STEADIER] = (config.steady if mixed else 0.0), config.steadier**2
     return q
 
 
-class _Search:
-    """One frame's arguments to the kernels, for the true array or its mirror image."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Question:
+    """One frame's spots and what is expected of them, as the kernels want them."""
 
-    def __init__(
-        self, plan: Plan, found: Spots, ray: Array, expected: Prior, config: MatchConfig, *, mirrored: bool
-    ) -> None:
-        flip = _MIRROR if mirrored else np.ones(3)
-        self.plan, self.found, self.config = plan, found, config
-        offset = (found.uv - plan.lens[3:5]) * (0.5 * plan.sigma_focal)
-        self.var = found.var + (offset**2).sum(axis=1)
-        self.log_clutter, self.ray = _log_clutter(found), ray
-        tilt_var, roll_sigma = float(1.0 / expected.info[:2].min()), float(expected.info[2] ** -0.5)
-        self.q = _parameters(plan, config, tilt_var, roll_sigma, mixed=not expected.measured)
-        self.Rp, self.info = expected.R_dock_cam, expected.info
-        self.p, self.axis = plan.p_dock * flip, plan.axis * flip
-        self.head = (plan.lens, self.p, plan.layer, self.axis, plan.survey_m2)
+    seen: Seen
+    expected: Expected
+    plan: Plan
+    config: MatchConfig
 
-    def run(self, floor: int, *leasts: int, best: float = _NONE) -> _Listed:
-        """Hypotheses that name at least `floor` lights, by searches that want ever fewer of one layer.
 
-        A later search runs only where the one before left doubt and the spots are few.
-        """
-        plan, found, k, count = self.plan, self.found, self.config.hypotheses, 0
-        names, scores = np.empty((k, len(self.p)), np.int64), np.empty(k)
-        Rs, ts = np.empty((k, 3, 3)), np.empty((k, 3))
-        for least in leasts:
-            count = kernel.search(
-                *self.head,
-                plan.rank,
-                found.uv,
-                self.ray,
-                self.var,
-                found.like,
-                self.log_clutter,
-                self.Rp,
-                self.info,
-                self.q,
-                plan.pairs,
-                plan.unseen,
-                floor,
-                least,
-                best,
-                count,
-                names,
-                scores,
-                Rs,
-                ts,
-            )
-            sure = count > 0 and scores[:count].max() > self.config.sure
-            if sure or len(found.uv) > self.config.max_spots_three:
-                break
-        order = np.argsort(-scores[:count], kind="stable")
-        return _Listed(names[order], scores[order], Rs[order], ts[order])
-
-    def other_pose(self, name: Indices, R: Array, t: Array) -> tuple[float, Array, Array]:
-        R2, t2 = np.empty((3, 3)), np.empty(3)
-        found = self.found
-        score = kernel.other_pose(
-            name, *self.head, found.uv, self.var, found.like, self.log_clutter, R, t, self.Rp, self.info, self.q, R2, t2
-        )
-        return score, R2, t2
-
-    def polish(self, name: Indices, R: Array, t: Array, score: float) -> _Polished:
-        """Follow the best relabelling as long as it is better."""
-        found, plan, m = self.found, self.plan, len(name)
-        for _ in range(_MAX_RELABELLINGS):
-            without, against, better = np.empty(m), np.empty(m), np.empty(m, np.int64)
-            R2, t2 = np.empty((3, 3)), np.empty(3)
-            best = kernel.rivals(
-                name,
-                light_of(name, len(found.uv)),
-                *self.head,
-                plan.rank,
-                found.uv,
-                self.var,
-                found.like,
-                self.log_clutter,
-                R,
-                t,
-                self.Rp,
-                self.info,
-                self.q,
-                without,
-                against,
-                better,
-                R2,
-                t2,
-            )
-            if best <= score:
-                break
-            name, R, t, score = better, R2, t2, best
-        return _Polished(name, R, t, score, without, against)
+def _question(plan: Plan, found: Spots, camera: Camera, expected: Prior, config: MatchConfig) -> _Question:
+    offset = (found.uv - plan.lens[3:5]) * (0.5 * plan.sigma_focal)
+    var = found.var + (offset**2).sum(axis=1)
+    tilt_var, roll_sigma = float(1.0 / expected.info[:2].min()), float(expected.info[2] ** -0.5)
+    q = _parameters(plan, config, tilt_var, roll_sigma, mixed=not expected.measured)
+    seen = Seen(found.uv, camera.unproject(found.uv), var, float(var.max(initial=0.0)), found.like, _log_clutter(found))
+    return _Question(seen, Expected(expected.R_dock_cam, expected.info, q), plan, config)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Listed:
-    """K hypotheses, best first: the detection `names` (K, M) each light is given, log evidence, and poses."""
+class _Found:
+    """K hypotheses, best first: the detection `names` (K, M) each light is given, log evidence, and poses.
+
+    `whole` says whether the search came to its end.
+    """
 
     names: Indices
     scores: Array
     Rs: Array
     ts: Array
+    whole: bool
+
+
+def _search(ask: _Question, lights: Lights, floor: int, *leasts: int, best: float = _NONE) -> _Found:
+    """Hypotheses that name at least `floor` lights, by searches that want ever fewer of one layer.
+
+    A later search runs only where the one before left doubt and the spots are few. `best` is a log evidence to measure
+    up to.
+    """
+    plan, k, count = ask.plan, ask.config.hypotheses, 0
+    listed = Listed(np.empty((k, len(lights.p)), np.int64), np.empty(k), np.empty((k, 3, 3)), np.empty((k, 3)))
+    budget = np.array([ask.config.max_pairs])
+    for least in leasts:
+        bounds = np.array([least, floor, floor, floor - 1 if floor > least else 0])
+        goal = Goal(bounds, budget, np.array([max(best, listed.scores[:count].max(initial=_NONE))]))
+        count = search(lights, ask.seen, ask.expected, plan.pairs, plan.unseen, goal, count, listed)
+        sure = count > 0 and listed.scores[:count].max() > ask.config.sure
+        if sure or len(ask.seen.uv) > ask.config.max_spots_three:
+            break
+    order = np.argsort(-listed.scores[:count], kind="stable")
+    names, scores, Rs, ts = listed
+    return _Found(names[order], scores[order], Rs[order], ts[order], bool(budget[0] >= 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -323,19 +278,35 @@ class _Polished:
     against: Array
 
 
+def _polish(ask: _Question, name: Indices, R: Array, t: Array, score: float) -> _Polished:
+    """Follow the best relabelling as long as it is better."""
+    m = len(name)
+    for _ in range(_MAX_RELABELLINGS):
+        without, against = np.empty(m), np.empty(m)
+        better = Best(np.empty(m, np.int64), np.empty((3, 3)), np.empty(3))
+        taken = light_of(name, len(ask.seen.uv))
+        best = rivals(name, taken, ask.plan.direct, ask.seen, ask.expected, R, t, without, against, better)
+        if best <= score:
+            break
+        name, R, t, score = *better, best
+    return _Polished(name, R, t, score, without, against)
+
+
 def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: MatchConfig) -> Acquisition:
     """The most probable naming of one frame's detections, and what it must be held against."""
-    ray = camera.unproject(found.uv)
-    direct = _Search(plan, found, ray, expected, config, mirrored=False)
-    listed = direct.run(3, 4, 3)
+    ask = _question(plan, found, camera, expected, config)
+    listed = _search(ask, plan.direct, 3, 4, 3)
+    if not listed.whole:
+        return Acquisition((), None, 0.0, "too_many")
     if not len(listed.scores):
         return Acquisition((), None, 0.0, "too_few" if len(found.uv) < 3 else "ambiguous")
-    top = direct.polish(listed.names[0], listed.Rs[0], listed.ts[0], float(listed.scores[0]))
-    other, R2, t2 = direct.other_pose(top.name, top.R, top.t)
+    top = _polish(ask, listed.names[0], listed.Rs[0], listed.ts[0], float(listed.scores[0]))
+    R2, t2 = np.empty((3, 3)), np.empty(3)
+    other = other_pose(top.name, plan.direct, ask.seen, ask.expected, top.R, top.t, R2, t2)
     best = float(np.logaddexp(top.score, other))
     kept = _kept(top, best, listed, _crowding(top.name, found, plan, config), plan, config)
-    conflicting = [s for name, s in zip(listed.names, listed.scores, strict=True) if _conflict(kept, name)]
-    mirror = _mirror_evidence(plan, found, ray, expected, config, top)
+    conflicting = listed.scores[conflicts(kept, listed.names)]
+    mirror = _mirror_evidence(ask, top)
     against = float(np.logaddexp.reduce([-config.log_dock, mirror, *top.against[kept >= 0], *conflicting]))
     rest = [
         Hypothesis(name, _pose(R, t), float(s))
@@ -348,7 +319,7 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
     return Acquisition((head, *rest), flipped, best - against, reason)
 
 
-def _kept(top: _Polished, best: float, listed: _Listed, crowding: float, plan: Plan, config: MatchConfig) -> Indices:
+def _kept(top: _Polished, best: float, listed: _Found, crowding: float, plan: Plan, config: MatchConfig) -> Indices:
     """The naming (M,) without what is not beyond doubt: single names, and layers with too few of them.
 
     The names beyond doubt stay; where they are fewer than `enough`, the likeliest of the others fill up.
@@ -375,23 +346,24 @@ def _crowding(name: Indices, found: Spots, plan: Plan, config: MatchConfig) -> f
     return max(0.0, math.log(local * plan.lens[6] * plan.lens[7] / config.spurious))
 
 
-def _mirror_evidence(
-    plan: Plan, found: Spots, ray: Array, expected: Prior, config: MatchConfig, top: _Polished
-) -> float:
+def _mirror_evidence(ask: _Question, top: _Polished) -> float:
     """Log evidence, prior included, that the water's surface shows the array: only where it stands above the camera."""
     named = int((top.name >= 0).sum())
-    listed = _Search(plan, found, ray, expected, config, mirrored=True).run(named, min(named, 4), best=top.score)
+    listed = _search(ask, ask.plan.mirrored, named, min(named, 4), best=top.score)
+    if not listed.whole:
+        return top.score
     camera_y = -np.einsum("ki,ki->k", listed.Rs[:, :, 1], listed.ts)
-    return float(np.logaddexp.reduce([_NONE, *listed.scores[camera_y < 0.0]])) + config.log_mirror
+    return float(np.logaddexp.reduce([_NONE, *listed.scores[camera_y < 0.0]])) + ask.config.log_mirror
 
 
-def _conflict(name: Indices, other: Indices) -> bool:
-    """Whether two namings (M,) differ in a light that both name, or in the light of a detection that both use."""
-    both = (name >= 0) & (other >= 0)
-    if (name[both] != other[both]).any():
-        return True
-    mine = {int(i): c for c, i in enumerate(name) if i >= 0}
-    return any(i >= 0 and mine.get(int(i), c) != c for c, i in enumerate(other))
+def conflicts(name: Indices, others: Indices) -> np.ndarray:
+    """Which of `others` (K, M) give a light of `name` (M,) another detection, or a detection another light: (K,)."""
+    both = (name >= 0) & (others >= 0)
+    light = np.full(max(int(name.max(initial=-1)), int(others.max(initial=-1))) + 2, -1)  # the last stands for none
+    light[name[name >= 0]] = np.flatnonzero(name >= 0)
+    theirs = light[others]
+    claimed = (others >= 0) & (theirs >= 0) & (theirs != np.arange(len(name)))
+    return np.asarray((both & (name != others) | claimed).any(axis=1))
 
 
 def light_of(name: Indices, n: int) -> Indices:

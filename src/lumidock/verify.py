@@ -6,7 +6,7 @@ import numpy as np
 
 from lumidock.config import Config, IntegrityConfig, MatchConfig, TrackConfig
 from lumidock.datatypes import Indices
-from lumidock.match import Acquisition
+from lumidock.match import Acquisition, conflicts
 from lumidock.track import Track
 
 _MIN_LOCK, _MIN_GATHERED = 4, 3
@@ -46,11 +46,7 @@ def gathered(beliefs: list[Track], found: Acquisition, config: Config) -> bool:
 
 def contradict(a: Indices, b: Indices) -> bool:
     """Whether two namings (M,) give a light two detections, or a detection two lights."""
-    both = (a >= 0) & (b >= 0)
-    if (a[both] != b[both]).any():
-        return True
-    only_a, only_b = a[(a >= 0) & ~both], b[(b >= 0) & ~both]
-    return bool(np.isin(only_a, b).any() or np.isin(only_b, a).any())
+    return bool(conflicts(a, b[None])[0])
 
 
 def is_proven(track: Track, margin: float, config: IntegrityConfig) -> bool:

@@ -28,21 +28,22 @@ def project(lens: Array, x: float, y: float, z: float) -> Projection:
         return _project_equidistant(lens, x, y, z)
     if not z > 0.0:
         return _unseen()
-    a, b = x / z, y / z
+    per_z = 1.0 / z
+    a, b = x * per_z, y * per_z
     w = a * a + b * b
     if w >= lens[5] * lens[5]:
         return _unseen()
-    k = lens[8:14]
-    p1, p2 = lens[14], lens[15]
-    den = 1.0 + w * (k[3] + w * (k[4] + w * k[5]))
-    g = (1.0 + w * (k[0] + w * (k[1] + w * k[2]))) / den
-    dg = (k[0] + w * (2.0 * k[1] + 3.0 * w * k[2]) - g * (k[3] + w * (2.0 * k[4] + 3.0 * w * k[5]))) / den
+    k1, k2, k3, k4, k5, k6, p1, p2 = lens[8], lens[9], lens[10], lens[11], lens[12], lens[13], lens[14], lens[15]
+    inverse = 1.0 / (1.0 + w * (k4 + w * (k5 + w * k6)))
+    g = (1.0 + w * (k1 + w * (k2 + w * k3))) * inverse
+    dg = (k1 + w * (2.0 * k2 + 3.0 * w * k3) - g * (k4 + w * (2.0 * k5 + 3.0 * w * k6))) * inverse
     u = a * g + 2.0 * p1 * a * b + p2 * (w + 2.0 * a * a)
     v = b * g + p1 * (w + 2.0 * b * b) + 2.0 * p2 * a * b
-    uu = (g + 2.0 * a * a * dg + 2.0 * p1 * b + 6.0 * p2 * a) * lens[1] / z
+    fx, fy = lens[1] * per_z, lens[2] * per_z
+    uu = (g + 2.0 * a * a * dg + 2.0 * p1 * b + 6.0 * p2 * a) * fx
     cross = 2.0 * a * b * dg + 2.0 * p1 * a + 2.0 * p2 * b
-    uv, vu = cross * lens[1] / z, cross * lens[2] / z
-    vv = (g + 2.0 * b * b * dg + 6.0 * p1 * b + 2.0 * p2 * a) * lens[2] / z
+    uv, vu = cross * fx, cross * fy
+    vv = (g + 2.0 * b * b * dg + 6.0 * p1 * b + 2.0 * p2 * a) * fy
     uz, vz = -(uu * a + uv * b), -(vu * a + vv * b)
     return True, u * lens[1] + lens[3], v * lens[2] + lens[4], uu, uv, uz, vu, vv, vz
 

@@ -1,0 +1,225 @@
+"""How probable a naming of one frame's detections is, with the pose integrated out.
+
+A hypothesis is `name` (M,): the detection that each light is given, or -1; and its pose `R`, `t` of T_cam_dock.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from lumidock._kernels.lens import inside
+from lumidock._kernels.pose import light_row, refine
+from lumidock.datatypes import Array, Indices
+
+# entries of the parameters `q`
+LOG_VOLUME, DETECT, ABSENT, GATE, NEAR_M, FAR_M, ROLL_GATE, BEND, STEADY, STEADIER, PAIR_GATE = range(11)
+LOG_2PI = math.log(2.0 * math.pi)
+HUGE = 1e300
+_EDGE_PX, _SHINES = 3.0, 0.1  # a light this near the edge, or seen this flat (cosine), may be missing at no cost
+
+
+class Lights(NamedTuple):
+    """The station as one lens sees it.
+
+    Lens (16,), positions `p` (M, 3) m, `layer` (M,), `axis` (M, 3), `survey_m2` (M,) variance of a position, and the
+    `rank` (M,) of each light in its layer.
+    """
+
+    lens: Array
+    p: Array
+    layer: Indices
+    axis: Array
+    survey_m2: Array
+    rank: Indices
+
+
+class Seen(NamedTuple):
+    """The detections of one frame.
+
+    `uv` (N, 2) px, `ray` (N, 3), `var` (N,) px^2 and the largest of them, log likelihood ratio of each for each layer
+    `like` (N, L), and `log_clutter` (N + 1,), the log price of naming so many.
+    """
+
+    uv: Array
+    ray: Array
+    var: Array
+    loosest: float
+    like: Array
+    log_clutter: Array
+
+
+class Expected(NamedTuple):
+    """The attitude prior `Rp` (3, 3) = R_dock_cam, `info` (3,) 1/rad^2 of tilt, tilt and roll; the parameters `q`."""
+
+    Rp: Array
+    info: Array
+    q: Array
+
+
+@njit(cache=True, error_model="numpy")
+def survey_var(lens: Array, R: Array, t: Array, p: Array, survey_m2: float) -> float:
+    """Variance px^2 that the survey error of a light at `p` (3,) adds."""
+    z = max(R[2, 0] * p[0] + R[2, 1] * p[1] + R[2, 2] * p[2] + t[2], 0.05)
+    return survey_m2 * lens[1] * lens[2] / (z * z)
+
+
+@njit(cache=True, error_model="numpy")
+def fit(
+    name: Indices,
+    lights: Lights,
+    seen: Seen,
+    R: Array,
+    t: Array,
+    Rp: Array,
+    info: Array,
+    steps: int,
+    H: Array,
+    L: Array,
+) -> tuple[float, float, float]:
+    """Most probable pose of the named lights, in place: cost, log det H, and the sum of log(2 pi variance)."""
+    m = len(name)
+    ps, uvs, vs = np.empty((m, 3)), np.empty((m, 2)), np.empty(m)
+    n, log_var = 0, 0.0
+    for c in range(m):
+        i = name[c]
+        if i < 0:
+            continue
+        ps[n] = lights.p[c]
+        uvs[n] = seen.uv[i]
+        vs[n] = seen.var[i] + survey_var(lights.lens, R, t, lights.p[c], lights.survey_m2[c])
+        log_var += LOG_2PI + math.log(vs[n])
+        n += 1
+    cost, log_det = refine(lights.lens, ps, uvs, vs, n, R, t, Rp, info, steps, H, L)
+    return cost, log_det, log_var
+
+
+@njit(cache=True, error_model="numpy")
+def log_evidence(
+    name: Indices,
+    lights: Lights,
+    seen: Seen,
+    R: Array,
+    t: Array,
+    info: Array,
+    q: Array,
+    fitted: tuple[float, float, float],
+) -> float:
+    """Log evidence of a hypothesis over "all clutter", the pose integrated out by Laplace's method."""
+    cost, log_det, log_var = fitted
+    if math.isnan(cost) or math.isnan(log_det):
+        return -HUGE
+    total = 1.5 * LOG_2PI - 0.5 * log_det - 0.5 * cost - log_var - seen.log_clutter[named(name)]
+    distance = max(math.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2]), q[NEAR_M])
+    # position prior: half flat inside the view cone, half flat in the logarithm of the distance
+    near = (q[FAR_M] / distance) ** 3 / (3.0 * math.log(q[FAR_M] / q[NEAR_M]))
+    total += math.log(0.5 + 0.5 * near) - q[LOG_VOLUME]
+    for k in range(3):
+        total += 0.5 * math.log(info[k])
+    layers = seen.like.shape[1]
+    matched, missed = np.zeros(layers, np.int64), np.zeros(layers, np.int64)
+    h = np.empty(14)
+    for c in range(len(name)):
+        i, layer = name[c], lights.layer[c]
+        if i >= 0:
+            total += math.log(q[DETECT]) + seen.like[i, layer]
+            matched[layer] += 1
+        elif light_row(lights.lens, R, t, lights.p[c], h) and inside(lights.lens, h[0], h[1], _EDGE_PX):
+            missed[layer] += _shines(lights, R, t, c)
+    for k in range(layers):
+        miss = missed[k] * math.log(1.0 - q[DETECT])
+        if matched[k] == 0 and missed[k] > 0:
+            miss = math.log(q[ABSENT] + (1.0 - q[ABSENT]) * math.exp(miss))
+        total += miss
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _shines(lights: Lights, R: Array, t: Array, c: int) -> bool:
+    """Whether light `c` sends its light toward the camera, which stands at -R^T t."""
+    norm, along = 0.0, 0.0
+    for k in range(3):
+        away = -(R[0, k] * t[0] + R[1, k] * t[1] + R[2, k] * t[2]) - lights.p[c, k]
+        norm += away * away
+        along += away * lights.axis[c, k]
+    return along > _SHINES * math.sqrt(norm)
+
+
+@njit(cache=True, error_model="numpy")
+def evidence(
+    name: Indices,
+    lights: Lights,
+    seen: Seen,
+    expected: Expected,
+    R: Array,
+    t: Array,
+    steps: int,
+    H: Array,
+    L: Array,
+) -> float:
+    """Log evidence of a naming whose pose is solved anew, in place, under the whole attitude prior.
+
+    The prior is a mixture: a share `STEADY` of vehicles holds its attitude `STEADIER` times (in variance) better.
+    `H` is left with the normal matrix under the wide part.
+    """
+    q = expected.q
+    fitted = fit(name, lights, seen, R, t, expected.Rp, expected.info, steps, H, L)
+    wide = log_evidence(name, lights, seen, R, t, expected.info, q, fitted)
+    if q[STEADY] <= 0.0 or wide <= -HUGE:
+        return wide
+    Rn, tn, Hn = R.copy(), t.copy(), np.empty((6, 6))
+    close = expected.info * q[STEADIER]
+    fitted = fit(name, lights, seen, Rn, tn, expected.Rp, close, steps, Hn, L)
+    narrow = log_evidence(name, lights, seen, Rn, tn, close, q, fitted)
+    return log_add(wide + math.log(1.0 - q[STEADY]), narrow + math.log(q[STEADY]))
+
+
+@njit(cache=True, error_model="numpy")
+def log_add(a: float, b: float) -> float:
+    """Logarithm of the sum of two numbers from their logarithms."""
+    high, low = max(a, b), min(a, b)
+    return high if low < high - 40.0 else high + math.log1p(math.exp(low - high))
+
+
+@njit(cache=True, error_model="numpy")
+def innovation(h: Array, P: Array, extra: float, S: Array) -> None:
+    """S (3,) = uu, uv, vv of the predicted pixel's covariance, `extra` px^2 on its diagonal."""
+    S[0], S[1], S[2] = extra, 0.0, extra
+    for i in range(6):
+        a, b = 0.0, 0.0
+        for j in range(6):
+            a += P[i, j] * h[2 + j]
+            b += P[i, j] * h[8 + j]
+        S[0] += h[2 + i] * a
+        S[1] += h[2 + i] * b
+        S[2] += h[8 + i] * b
+
+
+@njit(cache=True, error_model="numpy")
+def named(name: Indices) -> int:
+    """How many lights a naming names."""
+    n = 0
+    for c in range(len(name)):
+        n += name[c] >= 0
+    return n
+
+
+@njit(cache=True, error_model="numpy")
+def weigh(
+    uv: Array, cov: Array, p_rear: Array, p_light: Array, is_rear: Indices, trust: float, like: Array, var: Array
+) -> float:
+    """Fill `like` (N, L), softened log likelihood ratios, and `var` (N,) px^2 per axis; the area px^2 of all spots."""
+    low_u, high_u, low_v, high_v = np.inf, -np.inf, np.inf, -np.inf
+    layers = len(is_rear)
+    for i in range(len(uv)):
+        low_u, high_u = min(low_u, uv[i, 0]), max(high_u, uv[i, 0])
+        low_v, high_v = min(low_v, uv[i, 1]), max(high_v, uv[i, 1])
+        var[i] = 0.5 * (cov[i, 0, 0] + cov[i, 1, 1])
+        lamp = 0.0 if math.isnan(p_light[i]) else math.log(min(max(2.0 * p_light[i], 0.05), 1.0))
+        p = 0.5 if math.isnan(p_rear[i]) or layers == 1 else 0.5 + trust * (p_rear[i] - 0.5)
+        for k in range(layers):
+            like[i, k] = lamp + math.log(2.0 * (p if is_rear[k] == 1 or layers == 1 else 1.0 - p))
+    return (high_u - low_u) * (high_v - low_v)
