@@ -36,6 +36,7 @@ from lumidock.datatypes import Array, Indices
 
 SAME_TURN = 2e-3  # rad; closer solutions are one
 _THIRDS, _ALL_THIRDS = 3, 24  # third lights tried for a pair; and where three are all there may be
+_FOURTHS = 4  # fourth lights tried for each
 _BRANCHES, _FIRSTS = 2, 48  # first lights of another layer tried, of so many looked at
 _NEAR = 2.0  # gates within which a detection may still come to lie in its gate
 _CLOSE = 10.0  # log evidence; a naming of one layer this far behind the best is still tried with the others
@@ -134,7 +135,7 @@ def search(
             if tries[o, 0] < max(_wanted(goal, layers) - 2, 1):
                 break
             i, j, z, roll = int(tries[o, 1]), int(tries[o, 2]), tries[o, 3], tries[o, 4]
-            if not _known(listed.names, count, a, i, b, j):
+            if True:
                 count = _try_pair(a, b, i, j, z, roll, lights, seen, expected, by_u, view, thirds, goal, count, listed)
         if goal.budget[0] < 0:
             break
@@ -385,14 +386,13 @@ def _try_pair(
     """Grow namings from a pair and a third light, and list them. Each triple is tried once: the third ranks last."""
     layers = seen.like.shape[1]
     name, taken = np.empty(len(lights.p), np.int64), np.empty(len(seen.uv), np.int64)
-    R, t = np.empty((3, 3)), np.empty(3)
     _know_pair(a, b, i, j, z, roll, lights, seen, expected, view)
     _in_place(a, b, i, j, 0, lights, seen, expected, by_u, view)
     after = max(lights.rank[a], lights.rank[b])
     found = _thirds(i, j, after, lights, seen, expected.q[PAIR_GATE], view, thirds)
     for k in range(found):
         c, o = int(thirds[k, 1]), int(thirds[k, 2])
-        if _known(listed.names, count, a, i, c, o) and _known(listed.names, count, b, j, c, o):
+        if _known(listed.names, count, a, i, b, j, c, o):
             continue
         wanted = _wanted(goal, layers)
         if wanted > 3 and wanted > 3 + _support(c, o, i, j, lights, seen, by_u, view, expected.q[PAIR_GATE]):
@@ -400,8 +400,43 @@ def _try_pair(
         name[:] = -1
         taken[:] = -1
         name[a], name[b], name[c], taken[i], taken[j], taken[o] = i, j, o, a, b, c
-        R[:], t[:] = view.R, view.t
-        e = _grown(a, name, taken, lights, seen, expected, R, t, view.work, goal)
+        count = _try_three(name, taken, lights.layer[a], lights, seen, expected, view, goal, count, listed)
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def _try_three(
+    three: Indices,
+    held: Indices,
+    layer: int,
+    lights: Lights,
+    seen: Seen,
+    expected: Expected,
+    view: _View,
+    goal: Goal,
+    count: int,
+    listed: Listed,
+) -> int:
+    """Grow namings from three, and list them: the cheapest fourth light first, then others that it led away from."""
+    layers, work, fourths = seen.like.shape[1], view.work, np.empty((_FOURTHS, 3))
+    R3, t3 = view.R.copy(), view.t.copy()
+    fit(three, lights, seen, R3, t3, expected.Rp, expected.info, 6, work[0], work[1])
+    if math.isnan(invert6(work[0], work[1], work[2])):
+        return count
+    found, near = _best_lights(layer, three, held, lights, seen, R3, t3, work[2], expected.q[GATE], fourths)
+    first = three
+    for k in range(max(found, 1)):
+        if 3 + near < _wanted(goal, layers):
+            break
+        name, taken, R, t = three.copy(), held.copy(), R3.copy(), t3.copy()
+        if found:
+            c, o = int(fourths[k, 1]), int(fourths[k, 2])
+            if first[c] == o:
+                continue
+            name[c], taken[o] = o, c
+        e = _grown(layer, name, taken, lights, seen, expected, R, t, work, goal)
+        if k == 0:
+            first = name
         if e > -HUGE and named(name) >= goal.bounds[1]:
             count = _store(name, e, R, t, count, listed)
             _aim(name, e, lights.layer, layers, goal)
@@ -421,7 +456,7 @@ def _aim(name: Indices, e: float, layer: Indices, layers: int, goal: Goal) -> No
 
 @njit(cache=True, error_model="numpy")
 def _grown(
-    a: int,
+    layer: int,
     name: Indices,
     taken: Indices,
     lights: Lights,
@@ -432,9 +467,9 @@ def _grown(
     work: Array,
     goal: Goal,
 ) -> float:
-    """Log evidence of a naming of three, grown in place: first within the layer of `a`, then over all."""
+    """Log evidence of a naming of one layer, grown in place: first within the layer, then over all."""
     least = _wanted(goal, seen.like.shape[1])
-    fitted = grow(lights.layer[a], name, taken, lights, seen, expected, R, t, work, least)
+    fitted = grow(layer, name, taken, lights, seen, expected, R, t, work, least)
     e = log_evidence(name, lights, seen, R, t, expected.info, expected.q, fitted)
     if e <= -HUGE or named(name) < goal.bounds[0]:
         return -HUGE
@@ -718,10 +753,10 @@ def turn(Ra: Array, Rb: Array) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _known(names: Indices, count: int, a: int, i: int, b: int, j: int) -> bool:
-    """Whether a listed hypothesis gives light `a` detection `i`, and `b` `j`."""
+def _known(names: Indices, count: int, a: int, i: int, b: int, j: int, c: int, o: int) -> bool:
+    """Whether a listed hypothesis gives light `a` detection `i`, `b` `j` and `c` `o`."""
     for k in range(count):  # noqa: SIM110 - numba compiles no generator
-        if names[k, a] == i and names[k, b] == j:
+        if names[k, a] == i and names[k, b] == j and names[k, c] == o:
             return True
     return False
 
