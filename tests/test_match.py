@@ -178,6 +178,23 @@ def test_three_spots_alone_are_no_answer(rng):
         assert not answer(acquire(seen_from(pose(HEAD_ON, [0, 0, 8.0]), np.array(lights), rng)))
 
 
+def test_spots_that_hardly_look_like_lamps_stay_out(rng):
+    for frame in frames("missing-spurious", "path.count=5", "faults.missing=0", "faults.spurious=0", seed=8):
+        n, junk = len(frame.light), rng.uniform(0, 2000, (90, 2))
+        uv = np.concatenate([frame.detections.uv, junk])
+        order = rng.permutation(len(uv))
+        p_light = np.where(np.arange(len(uv)) < n, 0.9, 0.2)
+        found = acquire(replace(Detections.from_uv("f", 0, uv[order]), p_light=p_light[order]))
+        light = np.concatenate([frame.light, np.full(len(junk), -1)])[order]
+        assert answer(found)
+        assert wrong(found.candidates[0].name, light) == 0
+
+
+def test_a_frame_of_more_lamps_than_can_be_looked_at_is_no_answer(rng):
+    found = acquire(Detections.from_uv("f", 0, rng.uniform(0, 2000, (199, 2))))
+    assert (found.reason, found.candidates) == ("too_many", ())
+
+
 def test_spots_at_one_place_or_in_a_line_are_refused_quietly():
     for uv in (np.full((6, 2), 700.0), np.stack([np.linspace(200, 2200, 7), np.full(7, 900.0)], axis=1)):
         found = acquire(Detections.from_uv("f", 0, uv))

@@ -186,7 +186,7 @@ class MatchConfig(Section):
     detect: Annotated[float, Field(gt=0, lt=1)] = 0.8  # probability that a light in view is detected
     layer_absent: Annotated[float, Field(gt=0, lt=1)] = 0.3  # that a layer is not seen at all
     steady: Annotated[float, Field(ge=0, lt=1)] = 0.7  # share of vehicles that hold head-on better than the prior ...
-    steadier: PositiveFloat = 4.0  # ... by this factor; without an attitude sensor
+    steadier: PositiveFloat = 7.0  # ... by this factor; without an attitude sensor
     label_trust: Fraction = 0.6  # p_rear counts this much; a label of 0.95 becomes 0.77
     spurious: PositiveFloat = 5.0  # mean number of spurious spots
     clutter_near: Fraction = 0.02  # share of spurious spots that stand as close as the detections do
@@ -198,16 +198,19 @@ class MatchConfig(Section):
     near_m: PositiveFloat = 0.3
     far_m: PositiveFloat = 40.0  # of a light
     hypotheses: PositiveInt = 64
+    least_spots: PositiveInt = 16  # of more detections only the likeliest lamps are looked at, ...
+    spots_per_light: PositiveInt = 2  # ... so many, or this times the station's lights
     max_pairs: PositiveInt = 40_000  # pairs looked at in a frame, some 1.5 us each; a frame that wants more is refused
     log_dock: float = 2.0  # log prior odds that the dock is in view at all
     max_spots_three: PositiveInt = 14  # among more, three lights of a layer say nothing
     sure: PositiveFloat = 15.0  # log evidence above which three lights of each layer need not be looked for
     margin: PositiveFloat = 6.9  # log odds of the names on one frame, ln 1000
     margin_gathered: PositiveFloat = 9.2  # over frames, or with three lights
+    lead: PositiveFloat = 3.5  # log odds by which a naming gathered over frames must lead in the last one alone
     min_layer: PositiveInt = 3  # fewer lights of a second layer stay unnamed without history: they would set the tilt
     enough: PositiveInt = 4  # names that let the doubtful ones be dropped
-    extra: PositiveFloat = 10.0  # log odds of a name that a lock does not need
-    prune: PositiveFloat = 3.5  # log odds below which a single name is dropped in any case
+    extra: PositiveFloat = 8.5  # log odds of a name that a lock does not need
+    prune: PositiveFloat = 5.0  # log odds below which a single name is dropped in any case
     keep: PositiveFloat = 14.0  # candidates this far below the best are forgotten
     log_mirror: float = -8.1  # log prior of seeing the mirror image alone
 

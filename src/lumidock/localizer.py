@@ -132,13 +132,13 @@ class Localizer:
         Three lights of one plane fit many poses: only a track that has seen two layers lives on less than four.
         """
         enough = belief.n_used >= (1 if belief.joint else _MIN_SOLID)
-        unexplained = len(seen.uv) - belief.n_used
+        unexplained = seen.lamps - belief.n_used
         explains = belief.n_used >= _MIN_LIGHTS or unexplained < _MIN_SOLID
         return enough and explains and verify.innovation_holds(belief, self.config.track)
 
     def _overlooks(self, belief: Track, seen: Spots) -> bool:
         """Whether a second layer may be in view where the tilt was too open, or too wrong, to expect it there."""
-        if self._plan.n_layers == 1 or len(seen.uv) - belief.n_used < _MIN_SOLID:
+        if self._plan.n_layers == 1 or seen.lamps - belief.n_used < _MIN_SOLID:
             return False
         lately = belief.layer_ns > belief.t_ns - self.config.track.max_gap_s * 1e9
         named = np.bincount(self._plan.layer[belief.name >= 0], minlength=self._plan.n_layers) > 0

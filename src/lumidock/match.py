@@ -9,7 +9,7 @@ Theory, Inference, and Learning Algorithms", ch. 27).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,7 @@ _HEAD_ON = np.diag([1.0, -1.0, -1.0])
 _MIRROR = np.array([1.0, -1.0, 1.0])  # the water's surface is level, and so is dock x, z
 _NONE = -1e300
 _MAX_RELABELLINGS = 4
+_LAMP = 0.5
 _FLAT = 0.05  # a layer less thick than this share of its width is a plane
 
 
@@ -171,6 +172,7 @@ def prior(attitude: Attitude | None, config: PriorConfig) -> Prior:
 class Spots:
     """Detections as the kernels want them: N centres, their covariance and variance px^2, log likelihood ratios (N, L).
 
+    `p_light` (N,) is 1 where nobody has said how likely it is a lamp.
     `log_density` 1/px^2 of spurious spots: geometric in number about `spurious`, a share of them where the detections
     stand.
     """
@@ -179,7 +181,13 @@ class Spots:
     cov: Array
     var: Array
     like: Array
+    p_light: Array
     log_density: float
+
+    @property
+    def lamps(self) -> int:
+        """How many of the detections are rather lamps than not."""
+        return int((self.p_light >= _LAMP).sum())
 
 
 def spots(detections: Detections, plan: Plan, config: MatchConfig) -> Spots:
@@ -192,7 +200,8 @@ def spots(detections: Detections, plan: Plan, config: MatchConfig) -> Spots:
     whole, share = plan.lens[6] * plan.lens[7], config.clutter_near
     box = min(span + config.clutter_margin_px**2, whole) if n else whole
     density = (1.0 - share) / whole + share / box
-    return Spots(uv, cov, var, like, math.log(density * config.spurious / (1.0 + config.spurious)))
+    p_light = np.where(np.isnan(detections.p_light), 1.0, detections.p_light)
+    return Spots(uv, cov, var, like, p_light, math.log(density * config.spurious / (1.0 + config.spurious)))
 
 
 def _log_clutter(found: Spots) -> Array:
@@ -293,7 +302,14 @@ def _polish(ask: _Question, name: Indices, R: Array, t: Array, score: float) -> 
 
 
 def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: MatchConfig) -> Acquisition:
-    """The most probable naming of one frame's detections, and what it must be held against."""
+    """The most probable naming of one frame's detections, and what it must be held against.
+
+    Of many detections those that look least like lamps stay out.
+    """
+    likely = _likeliest(found, max(config.least_spots, config.spots_per_light * len(plan.p_dock)))
+    if likely is not None:
+        part = replace(found, **{key: getattr(found, key)[likely] for key in ("uv", "cov", "var", "like", "p_light")})
+        return _renamed(acquire(part, plan, camera, expected, config), likely)
     ask = _question(plan, found, camera, expected, config)
     listed = _search(ask, plan.direct, 3, 4, 3)
     if not listed.whole:
@@ -317,6 +333,24 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
     head = Hypothesis(kept, _pose(top.R, top.t), top.score)
     reason = "mirror" if mirror > best - config.margin else "ambiguous"
     return Acquisition((head, *rest), flipped, best - against, reason)
+
+
+def _likeliest(found: Spots, most: int) -> Indices | None:
+    """The detections (K,) that look most like lamps, `most` and those on a par; None where that leaves none out."""
+    if len(found.uv) <= most:
+        return None
+    likely = np.flatnonzero(found.p_light >= np.partition(found.p_light, -most)[-most])
+    return likely if len(likely) < len(found.uv) else None
+
+
+def _renamed(found: Acquisition, detections: Indices) -> Acquisition:
+    """An acquisition among some `detections` (K,), in the numbers of all."""
+
+    def of_all(part: Hypothesis) -> Hypothesis:
+        return replace(part, name=np.where(part.name >= 0, detections[part.name], -1))
+
+    flipped = of_all(found.flipped) if found.flipped else None
+    return replace(found, candidates=tuple(map(of_all, found.candidates)), flipped=flipped)
 
 
 def _kept(top: _Polished, best: float, listed: _Found, crowding: float, plan: Plan, config: MatchConfig) -> Indices:

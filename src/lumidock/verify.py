@@ -37,7 +37,7 @@ def gathered(beliefs: list[Track], found: Acquisition, config: Config) -> bool:
         return False
     own = [c.log_evidence for c in found.candidates if (c.name == first.name).all()]
     now = [c.log_evidence for c in found.candidates if contradict(first.name, c.name)]
-    if not own or (now and max(own) - max(now) < config.match.prune):
+    if not own or (now and max(own) - max(now) < config.match.lead):
         return False
     rivals = [b.log_weight for b in beliefs[1:] if contradict(first.name, b.name)]
     against = float(np.logaddexp.reduce([-config.match.log_dock, *rivals]))
