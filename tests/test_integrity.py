@@ -42,6 +42,13 @@ def at(z, rng=None):
     return T if rng is None else T @ se3_exp(rng.uniform(-1, 1, 6) * [1, 1, 1, 0.1, 0.1, 0.3])
 
 
+def pose(place):
+    """Head-on at `place` (3,) m in the dock."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.diag([1.0, -1.0, -1.0]), place
+    return T
+
+
 def covariance(rng, sigma=(0.01, 0.01, 0.03, 0.002, 0.002, 0.001)):
     """A correlated pose covariance (6, 6), small enough to be linear."""
     A = np.diag(sigma) @ rng.normal(size=(6, 9)) / 3.0
@@ -103,6 +110,17 @@ def test_levels_hold_as_often_as_they_say(z_m, rng):
     scale = np.sqrt(np.diagonal(bound.covariance))
     assert_close(np.cov(errors.T) / np.outer(scale, scale), bound.covariance / np.outer(scale, scale), atol=0.12)
     assert abs(trust.nees(errors, np.repeat(bound.covariance[None], n, axis=0)).mean() - 6.0) < 0.3
+
+
+@pytest.mark.parametrize("place", [[0.0, 0.5, 0.08], [0.4, 0.01, 0.09], [0.02, 0.01, 0.0], [0.3, 0.02, -0.08]])
+def test_bearings_beside_the_origin_are_bounded(place, rng):
+    T_cam_dock = se3_inverse(pose(place))
+    level = bounds([belief(pose(place), np.eye(6) * 0.02**2)], IntegrityConfig()).guide.pl_bearing_rad
+    x, y, z = (T_cam_dock[:3, 3] + rng.normal(0.0, 0.02, (1_000_000, 3))).T
+    off = [
+        np.arctan2(a, z) - math.atan2(c, T_cam_dock[2, 3]) for a, c in ((x, T_cam_dock[0, 3]), (y, T_cam_dock[1, 3]))
+    ]
+    assert np.hypot(*(np.remainder(a + np.pi, 2 * np.pi) - np.pi for a in off)).max() < level
 
 
 def test_bounds_say_where_the_dock_is(rng):

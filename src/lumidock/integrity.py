@@ -19,7 +19,8 @@ from lumidock.track import Track
 _NEAR_LIMITS = ((1.5, 0.3, 5.0), (5.0, 0.5, 5.0), (12.0, 1.0, 8.0))
 _FAR_SHARE, _FAR_DEG = 0.10, 10.0  # beyond: a share of z, and degrees
 GUIDE_BEARING_RAD, GUIDE_RANGE_M, GUIDE_RANGE_SHARE = math.radians(1.5), 0.3, 0.10
-_ANY_BEARING = math.sqrt(2.0) * math.pi  # at the origin itself a bearing says nothing
+_ANY_BEARING = math.sqrt(2.0) * math.pi  # at the origin itself a bearing says nothing ...
+_CLEAR, _STEEP = 2.0, 0.3  # ... which begins so many range levels away, or with a bearing level of so many rad
 GUIDE_FROM_M = 3.0  # nearer to the dock's origin, or past it, bearing and range say nothing and the pose decides
 
 
@@ -72,6 +73,7 @@ def bounds(beliefs: Sequence[Track], config: IntegrityConfig) -> Bounds:
     x, y, z = first.t.tolist()
     reach = math.sqrt(x * x + y * y + z * z)
     lateral, axial, angle, bearing, distance = pl.tolist()
+    linear = bearing < _STEEP and min(math.hypot(x, z), math.hypot(y, z)) > _CLEAR * distance
     return Bounds(
         T_dock_cam,
         cov[:6, :6],
@@ -80,7 +82,7 @@ def bounds(beliefs: Sequence[Track], config: IntegrityConfig) -> Bounds:
             math.atan2(x, z),
             math.atan2(y, z),
             reach,
-            bearing if reach > distance else max(bearing, _ANY_BEARING),
+            bearing if linear else max(bearing, _ANY_BEARING),
             distance,
         ),
     )
