@@ -109,6 +109,66 @@ def test_the_covariance_of_valid_poses_is_honest():
     assert 0.0 < trust.nees(errors, np.array([x.covariance for _, x in both])).mean() < 7.0
 
 
+EXACT = replace(STATION, sigma_light_m=0.0, sigma_layer_m=0.0, sigma_focal=0.0, sigma_center_px=0.0)
+
+
+def cramer_rao(T_dock_cam, lights, sigma_px=0.5):
+    """Covariance (6, 6) of the pose in dock axes that no unbiased estimator can beat, by finite differences."""
+    step, columns = 1e-6, []
+    for k in range(6):
+        xi = np.zeros(6)
+        xi[k] = step
+        T = T_dock_cam.copy()
+        T[:3, 3] += xi[:3]
+        T[:3, :3] = Rotation.from_rotvec(xi[3:]).as_matrix() @ T[:3, :3]
+        moved = project_lights(CAMERA, T, STATION.p_dock[lights]) - project_lights(
+            CAMERA, T_dock_cam, STATION.p_dock[lights]
+        )
+        columns.append(moved.ravel() / step / sigma_px)
+    J = np.stack(columns, axis=1)
+    return np.linalg.inv(J.T @ J)
+
+
+@pytest.mark.parametrize(("z_m", "layers"), [(8.0, "joint"), (14.0, "joint"), (5.0, "missing-1")])
+def test_cold_poses_are_as_good_as_the_light_allows(z_m, layers):
+    settings = ["path.count=120", f"path.z_m=[{z_m}, {z_m + 0.001}]", "faults.spurious=0", "faults.missing=0"]
+    frames = frames_of(layers, *settings, "spots.drop=0", "spots.wrong_layer=0", seed=11)
+    localizer, squares, laterals = Localizer(EXACT, CAMERA, cold=True), [], []
+    for frame in frames:
+        localizer.process_detections(frame.detections)
+        T_cam_dock = localizer.beliefs[0].T_cam_dock
+        e = trust.pose_error(np.linalg.inv(T_cam_dock), frame.T_dock_cam)
+        bound = cramer_rao(frame.T_dock_cam, frame.light[frame.light >= 0])
+        squares.append(e @ np.linalg.solve(bound, e))
+        laterals.append(np.hypot(e[0], e[1]))
+    # six degrees of freedom; an error 1.5 times the bound would give 13.5
+    assert np.mean(squares) < 6.0 * 1.25**2
+    if layers == "joint" and z_m == 8.0:
+        assert np.sqrt(np.mean(np.square(laterals))) < 0.006
+
+
+def test_layers_that_come_and_go_make_no_jump():
+    """The error moves by less than three sigma where the lights of the rear layer appear or vanish."""
+    frames, localizer = frames_of("nominal", "path.start_z_m=13", "path.end_z_m=2", seed=31), Localizer(STATION, CAMERA)
+    rear = STATION.layer == STATION.layers.index("rear")
+    before, moves = None, []
+    for k, frame in enumerate(frames):
+        hidden = (k // 12) % 3 == 2
+        keep = ~(hidden & (frame.light >= 0) & rear[frame.light])
+        d = frame.detections
+        seen = replace(d, **{key: getattr(d, key)[keep] for key in ("uv", "radius_px", "flux", "p_light", "p_rear")})
+        fix = localizer.process_detections(seen)
+        if fix.valid:
+            e, sigma = trust.pose_error(fix.T_dock_cam, frame.T_dock_cam), np.sqrt(np.diagonal(fix.covariance))
+            if before is not None and before[0] != hidden:
+                moves.append(np.abs(e - before[1]) / np.hypot(sigma, before[2]))
+            before = hidden, e, sigma
+        else:
+            before = None
+    assert len(moves) > 6
+    assert np.max(moves) < 3.0
+
+
 def test_one_layer_alone_is_enough_near_the_dock():
     """Survey errors there are larger in the picture than noise: leaving one of seven lights out says something."""
     settings = ("path.start_z_m=9", "path.end_z_m=3", "path.frame_interval_s=0.0666667", "spots.rear_range_m=0.01")

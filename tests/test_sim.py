@@ -244,8 +244,14 @@ def test_draws_are_spread_and_have_the_front_layer_in_view():
 
 def test_any_roll_is_any():
     tilt, roll = turns(frames_of("any-roll", "path.hold=1", "path.count=2000"))
-    assert 29.0 < tilt.max() <= 30.0 + 1e-6
+    assert 3.0 < tilt.max() < 3.0 * 2**0.5 + 1e-3
     np.testing.assert_allclose(np.percentile(roll, [0, 25, 50, 75, 100]), [-180, -90, 0, 90, 180], atol=12)
+
+
+def test_a_wide_tilt_is_wide_and_leaves_the_roll():
+    tilt, roll = turns(frames_of("wide-tilt", "path.hold=1", "path.count=2000"))
+    assert 29.0 < tilt.max() <= 30.0 + 1e-6
+    assert np.abs(roll).max() < 3.0 + 1e-6
 
 
 def test_held_frames_move_slowly_and_miss_the_same_lights():
