@@ -27,6 +27,7 @@ _MIRROR = np.array([1.0, -1.0, 1.0])  # the water's surface is level, and so is 
 _NONE = -1e300
 _MAX_RELABELLINGS = 4
 _LAMP = 0.5
+_OPEN_ROLL = math.radians(45.0)  # 1 sigma; of a roll less known than this a steady vehicle says nothing
 _FLAT = 0.05  # a layer less thick than this share of its width is a plane
 
 
@@ -210,14 +211,14 @@ def _log_clutter(found: Spots) -> Array:
 
 
 def _parameters(plan: Plan, config: MatchConfig, tilt_var: float, roll_sigma: float, *, mixed: bool) -> Array:
-    q = np.empty(11)
+    q = np.empty(10)
     q[kernel.LOG_VOLUME] = plan.log_volume
     q[kernel.DETECT], q[kernel.ABSENT] = config.detect, config.layer_absent
     q[kernel.GATE], q[kernel.NEAR_M], q[kernel.FAR_M] = config.gate, config.near_m, config.far_m
     q[kernel.PAIR_GATE] = config.pair_gate
     q[kernel.ROLL_GATE] = min(config.roll_gate * roll_sigma, math.pi)
     q[kernel.BEND] = (config.bend * tilt_var) ** 2
-    q[kernel.STEADY], q[kernel.STEADIER] = (config.steady if mixed else 0.0), config.steadier**2
+    q[kernel.STEADY] = config.steady if mixed else 0.0
     return q
 
 
@@ -237,7 +238,10 @@ def _question(plan: Plan, found: Spots, camera: Camera, expected: Prior, config:
     tilt_var, roll_sigma = float(1.0 / expected.info[:2].min()), float(expected.info[2] ** -0.5)
     q = _parameters(plan, config, tilt_var, roll_sigma, mixed=not expected.measured)
     seen = Seen(found.uv, camera.unproject(found.uv), var, float(var.max(initial=0.0)), found.like, _log_clutter(found))
-    return _Question(seen, Expected(expected.R_dock_cam, expected.info, q), plan, config)
+    steady = expected.info * config.steadier**2
+    if roll_sigma > _OPEN_ROLL:
+        steady[2] = expected.info[2]
+    return _Question(seen, Expected(expected.R_dock_cam, expected.info, steady, q), plan, config)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -331,7 +335,8 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
     ]
     flipped = Hypothesis(kept, _pose(R2, t2), other) if other > top.score - config.keep else None
     head = Hypothesis(kept, _pose(top.R, top.t), top.score)
-    reason = "mirror" if mirror > best - config.margin else "ambiguous"
+    direct = float(np.logaddexp.reduce([_NONE, *listed.scores[(listed.names != top.name).any(axis=1)]]))
+    reason = "mirror" if mirror > max(best - config.margin, direct) else "ambiguous"
     return Acquisition((head, *rest), flipped, best - against, reason)
 
 

@@ -16,7 +16,7 @@ from lumidock._kernels.pose import light_row, refine
 from lumidock.datatypes import Array, Indices
 
 # entries of the parameters `q`
-LOG_VOLUME, DETECT, ABSENT, GATE, NEAR_M, FAR_M, ROLL_GATE, BEND, STEADY, STEADIER, PAIR_GATE = range(11)
+LOG_VOLUME, DETECT, ABSENT, GATE, NEAR_M, FAR_M, ROLL_GATE, BEND, STEADY, PAIR_GATE = range(10)
 LOG_2PI = math.log(2.0 * math.pi)
 HUGE = 1e300
 _EDGE_PX, _SHINES = 3.0, 0.1  # a light this near the edge, or seen this flat (cosine), may be missing at no cost
@@ -53,10 +53,15 @@ class Seen(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """The attitude prior `Rp` (3, 3) = R_dock_cam, `info` (3,) 1/rad^2 of tilt, tilt and roll; the parameters `q`."""
+    """The attitude prior and the parameters `q`.
+
+    `Rp` (3, 3) = R_dock_cam, `info` (3,) 1/rad^2 of tilt, tilt and roll, and `steady` (3,) the same of a vehicle that
+    holds its attitude well.
+    """
 
     Rp: Array
     info: Array
+    steady: Array
     q: Array
 
 
@@ -162,7 +167,7 @@ def evidence(
 ) -> float:
     """Log evidence of a naming whose pose is solved anew, in place, under the whole attitude prior.
 
-    The prior is a mixture: a share `STEADY` of vehicles holds its attitude `STEADIER` times (in variance) better.
+    The prior is a mixture: a share `STEADY` of vehicles holds its attitude as `expected.steady` says.
     `H` is left with the normal matrix under the wide part.
     """
     q = expected.q
@@ -171,9 +176,8 @@ def evidence(
     if q[STEADY] <= 0.0 or wide <= -HUGE:
         return wide
     Rn, tn, Hn = R.copy(), t.copy(), np.empty((6, 6))
-    close = expected.info * q[STEADIER]
-    fitted = fit(name, lights, seen, Rn, tn, expected.Rp, close, steps, Hn, L)
-    narrow = log_evidence(name, lights, seen, Rn, tn, close, q, fitted)
+    fitted = fit(name, lights, seen, Rn, tn, expected.Rp, expected.steady, steps, Hn, L)
+    narrow = log_evidence(name, lights, seen, Rn, tn, expected.steady, q, fitted)
     return log_add(wide + math.log(1.0 - q[STEADY]), narrow + math.log(q[STEADY]))
 
 
