@@ -1,13 +1,19 @@
+from dataclasses import replace
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 from conftest import assert_close, numeric_jacobian, transform
 from scipy.spatial.transform import Rotation
 
-from lumidock.camera import Camera
+from lumidock.camera import Camera, load_camera
 from lumidock.geometry import se3_exp
-from lumidock.pose import project_lights, project_lights_with_jacobian, reprojection_rms_px, sqpnp
+from lumidock.pose import project_lights, project_lights_with_jacobian, reprojection_rms_px, solve, sqpnp
+from lumidock.station import load_station
+from lumidock.trust import pose_error
 
+ROOT = Path(__file__).parents[1]
 K = np.array([[1400.0, 0.0, 1000.0], [0.0, 1400.0, 800.0], [0.0, 0.0, 1.0]])
 PLANE = np.array([[-1, 0.6, 0], [1, 0.5, 0], [0.9, -0.6, 0], [-0.8, -0.5, 0], [0.1, 0.9, 0]])
 DEEP = np.vstack([PLANE[:3], [[-0.6, 0.4, -5], [0.6, 0.5, -5], [0.0, -0.7, -5]]])
@@ -104,3 +110,65 @@ def test_reprojection_rms_is_in_pixels(camera, T_dock_cam):
     assert_close(reprojection_rms_px(camera, T_dock_cam, DEEP, uv + np.array([3, -4])), 5.0)
     one_off = uv + 6.0 * np.eye(len(DEEP))[:, :1] * [1, 0]
     assert_close(reprojection_rms_px(camera, T_dock_cam, DEEP, one_off), 6.0 / np.sqrt(len(DEEP)))
+
+
+STATION = load_station(ROOT / "stations" / "cage-2x2x5.yaml")
+CAMERA = load_camera(ROOT / "cameras" / "imx264-60deg.yaml")
+FRONT, ALL = np.arange(7), np.arange(13)
+
+
+def drawn(rng, T_dock_cam, lights, *, pixels=0.5):
+    """Pixels of the lights of a dock that is not where the survey says, through a lens that is not as calibrated."""
+    p_dock = STATION.p_dock + rng.normal(0, STATION.sigma_light_m, (13, 3))
+    p_dock += rng.normal(0, STATION.sigma_layer_m, (2, 3))[STATION.layer]
+    uv = project_lights(CAMERA, T_dock_cam, p_dock[lights])
+    uv = (uv - CAMERA.center_px) * (1 + rng.normal(0, STATION.sigma_focal)) + CAMERA.center_px
+    return uv + rng.normal(0, STATION.sigma_center_px, 2) + rng.normal(0, pixels, uv.shape)
+
+
+def head_on(rng, z, tilt=0.1):
+    """A camera about head-on at `z`."""
+    turn = Rotation.from_rotvec(rng.uniform(-tilt, tilt, 3)).as_matrix()
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.diag([1.0, -1.0, -1.0]) @ turn, [*rng.uniform(-0.05, 0.05, 2) * z, z]
+    return T
+
+
+@pytest.mark.parametrize(("z", "lights"), [(3.0, FRONT), (6.0, ALL), (15.0, ALL), (-2.0, np.arange(7, 13))])
+def test_covariances_of_solutions_hold_with_survey_and_calibration_errors_in(z, lights, rng):
+    squares = []
+    for _ in range(200):
+        T_dock_cam = head_on(rng, z)
+        best = solve(STATION, CAMERA, lights, drawn(rng, T_dock_cam, lights))[0]
+        e = pose_error(best.T_dock_cam, T_dock_cam)
+        squares.append(e @ np.linalg.solve(best.covariance, e))
+    assert 5.3 < np.mean(squares) < 6.8  # chi-square, 6 dof, mean of 200: 99 % lie here
+
+
+def test_exact_pixels_give_back_the_pose(rng):
+    for z in (3.0, 9.0, 18.0):
+        T_dock_cam = head_on(rng, z)
+        found = solve(STATION, CAMERA, ALL, project_lights(CAMERA, T_dock_cam, STATION.p_dock))
+        assert len(found) == 1
+        assert_close(found[0].T_dock_cam, T_dock_cam, atol=1e-6)
+        assert found[0].chi2 < 1e-6
+
+
+def test_a_plane_far_away_has_two_poses_and_two_layers_have_one(rng):
+    two = 0
+    for _ in range(40):
+        T_dock_cam = head_on(rng, 26.0, 0.3)
+        uv = drawn(rng, T_dock_cam, ALL)
+        found = solve(STATION, CAMERA, FRONT, uv[:7])
+        assert [one.chi2 for one in found] == sorted(one.chi2 for one in found)
+        two += len(found) == 2
+        assert len(solve(STATION, CAMERA, ALL, uv)) == 1
+    assert two > 8
+
+
+def test_lights_that_leave_the_pose_open_give_none():
+    line = STATION.p_dock[[0, 0, 0]] + np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
+    crooked = replace(STATION, p_dock=np.concatenate([line, STATION.p_dock[3:]]))
+    uv = project_lights(CAMERA, head_on(np.random.default_rng(0), 8.0), line)
+    assert solve(crooked, CAMERA, np.arange(3), uv) == ()
+    assert solve(STATION, CAMERA, np.arange(2), uv[:2]) == ()

@@ -6,6 +6,7 @@ from lumidock.datatypes import Attitude, Detections, Fix, Frame, Guide, LayerPos
 from lumidock.errors import FrameError, InputError, LumidockError
 from lumidock.localizer import Localizer
 from lumidock.paper import PaperLocalizer
+from lumidock.pose import PoseSolution, solve
 from lumidock.station import Station, load_station
 
 __all__ = [
@@ -24,9 +25,11 @@ __all__ = [
     "Match",
     "PaperConfig",
     "PaperLocalizer",
+    "PoseSolution",
     "Protection",
     "Station",
     "load_camera",
     "load_config",
     "load_station",
+    "solve",
 ]
