@@ -16,12 +16,14 @@ from bench.shipped import CAMERA_FILE, STATION_FILE, shipped_camera, shipped_sta
 
 from lumidock import campaign as module
 from lumidock import cli, trust
-from lumidock.campaign import Run, Tally, plan, prepare, rotation_vectors, row_of, run_campaign, tabulate, tally_run
+from lumidock.campaign import plan, prepare, run_campaign, tabulate
+from lumidock.campaign_table import row_of
 from lumidock.datatypes import Fix, Guide, Match, Protection
 from lumidock.errors import InputError, LumidockError
 from lumidock.geometry import bearing_and_range, so3_exp, so3_log
 from lumidock.sim.scenario import load_scenario
 from lumidock.sim.spots import spot_frames
+from lumidock.tally import Run, Tally, guide_claims, pose_claims, rotation_vectors, tally_run
 
 STATION, CAMERA = shipped_station(), shipped_camera()
 LUMIDOCK = str(Path(sys.executable).with_name("lumidock"))
@@ -269,9 +271,9 @@ def test_claims_agree_with_those_of_one_at_a_time():
     frames = list(spot_frames(load_scenario("any-roll", ("path.count=30",)), STATION, CAMERA, 0))
     pairs = [(frame, right(frame, T_dock_cam=moved(frame, (0.1, 0.2, 0.3), (0.1, -0.3, 0.2)))) for frame in frames]
     errors = [trust.pose_error(fix.T_dock_cam, frame.T_dock_cam) for frame, fix in pairs]
-    np.testing.assert_allclose(module.pose_claims(pairs).errors, errors, atol=1e-12)
+    np.testing.assert_allclose(pose_claims(pairs).errors, errors, atol=1e-12)
     true = [trust.true_guide(frame.T_dock_cam) for frame in frames]
-    np.testing.assert_allclose(module.guide_claims(pairs).true, true, atol=1e-12)
+    np.testing.assert_allclose(guide_claims(pairs).true, true, atol=1e-12)
 
 
 def test_quantiles_of_a_histogram_are_good_to_a_hundredth(rng):

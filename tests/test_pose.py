@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from lumidock.camera import Camera, load_camera
 from lumidock.geometry import se3_exp
-from lumidock.pose import project_lights, project_lights_with_jacobian, reprojection_rms_px, solve, sqpnp
+from lumidock.pose import project_lights, project_lights_with_jacobian, reprojection_rms_px, solve_pose, sqpnp
 from lumidock.station import load_station
 from lumidock.trust import pose_error
 
@@ -139,7 +139,7 @@ def test_covariances_of_solutions_hold_with_survey_and_calibration_errors_in(z, 
     squares = []
     for _ in range(200):
         T_dock_cam = head_on(rng, z)
-        best = solve(STATION, CAMERA, lights, drawn(rng, T_dock_cam, lights))[0]
+        best = solve_pose(STATION, CAMERA, lights, drawn(rng, T_dock_cam, lights))[0]
         e = pose_error(best.T_dock_cam, T_dock_cam)
         squares.append(e @ np.linalg.solve(best.covariance, e))
     assert 5.3 < np.mean(squares) < 6.8  # chi-square, 6 dof, mean of 200: 99 % lie here
@@ -148,7 +148,7 @@ def test_covariances_of_solutions_hold_with_survey_and_calibration_errors_in(z, 
 def test_exact_pixels_give_back_the_pose(rng):
     for z in (3.0, 9.0, 18.0):
         T_dock_cam = head_on(rng, z)
-        found = solve(STATION, CAMERA, ALL, project_lights(CAMERA, T_dock_cam, STATION.p_dock))
+        found = solve_pose(STATION, CAMERA, ALL, project_lights(CAMERA, T_dock_cam, STATION.p_dock))
         assert len(found) == 1
         assert_close(found[0].T_dock_cam, T_dock_cam, atol=1e-6)
         assert found[0].chi2 < 1e-6
@@ -159,10 +159,10 @@ def test_a_plane_far_away_has_two_poses_and_two_layers_have_one(rng):
     for _ in range(40):
         T_dock_cam = head_on(rng, 26.0, 0.3)
         uv = drawn(rng, T_dock_cam, ALL)
-        found = solve(STATION, CAMERA, FRONT, uv[:7])
+        found = solve_pose(STATION, CAMERA, FRONT, uv[:7])
         assert [one.chi2 for one in found] == sorted(one.chi2 for one in found)
         two += len(found) == 2
-        assert len(solve(STATION, CAMERA, ALL, uv)) == 1
+        assert len(solve_pose(STATION, CAMERA, ALL, uv)) == 1
     assert two > 8
 
 
@@ -170,5 +170,5 @@ def test_lights_that_leave_the_pose_open_give_none():
     line = STATION.p_dock[[0, 0, 0]] + np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
     crooked = replace(STATION, p_dock=np.concatenate([line, STATION.p_dock[3:]]))
     uv = project_lights(CAMERA, head_on(np.random.default_rng(0), 8.0), line)
-    assert solve(crooked, CAMERA, np.arange(3), uv) == ()
-    assert solve(STATION, CAMERA, np.arange(2), uv[:2]) == ()
+    assert solve_pose(crooked, CAMERA, np.arange(3), uv) == ()
+    assert solve_pose(STATION, CAMERA, np.arange(2), uv[:2]) == ()

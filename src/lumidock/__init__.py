@@ -6,7 +6,7 @@ from lumidock.datatypes import Attitude, Detections, Fix, Frame, Guide, LayerPos
 from lumidock.errors import FrameError, InputError, LumidockError
 from lumidock.localizer import Localizer
 from lumidock.paper import PaperLocalizer
-from lumidock.pose import PoseSolution, solve
+from lumidock.pose import PoseSolution, solve_pose
 from lumidock.station import Station, load_station
 
 __all__ = [
@@ -31,5 +31,5 @@ __all__ = [
     "load_camera",
     "load_config",
     "load_station",
-    "solve",
+    "solve_pose",
 ]

@@ -263,7 +263,8 @@ def _campaign(
     as_json: AsJson = False,
 ) -> None:
     """Run scenarios x seeds x methods on bare detections, and count."""
-    from lumidock.campaign import METHODS, markdown, plan, prepare, run_campaign, tabulate
+    from lumidock.campaign import METHODS, plan, prepare, run_campaign, tabulate
+    from lumidock.campaign_table import markdown
     from lumidock.sim.scenario import load_scenario
 
     for method in methods or ():

@@ -76,7 +76,7 @@ class PoseSolution:
     chi2: float
 
 
-def solve(
+def solve_pose(
     station: Station, camera: Camera, lights: Indices, uv: Array, cov_px2: Array | None = None, noise_px: float = 0.5
 ) -> tuple[PoseSolution, ...]:
     """The poses that one frame's named lights allow, the likeliest first: two where the flip of a plane leaves two.
