@@ -169,6 +169,13 @@ def test_layers_that_come_and_go_make_no_jump():
     assert np.max(moves) < 3.0
 
 
+def test_innovations_are_as_large_as_they_should_be():
+    frames = frames_of("nominal", seed=33)
+    nis = np.array([fix.nis for fix in run(frames)])
+    assert np.isfinite(nis).sum() > 300
+    assert 0.8 < np.nanmean(nis) < 1.1  # names are gated and gates are cautious, which takes a little off the mean
+
+
 def test_one_layer_alone_is_enough_near_the_dock():
     """Survey errors there are larger in the picture than noise: leaving one of seven lights out says something."""
     settings = ("path.start_z_m=9", "path.end_z_m=3", "path.frame_interval_s=0.0666667", "spots.rear_range_m=0.01")

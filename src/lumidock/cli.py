@@ -487,6 +487,10 @@ def _print_trust(result: dict[str, Any]) -> None:
     if nees["frames"]:
         stages = {stage: f"{mean['mean']:.2f}" for stage, mean in nees["by_stage"].items()}
         print(f"NEES {nees['mean']:.2f} over {nees['frames']} frames, honest is 6: {_words(stages)}")
+    if result["nis"]:
+        print(
+            f"NIS {result['nis']['mean']:.2f} per degree of freedom over {result['nis']['frames']} frames, honest is 1"
+        )
     if nees["improper"]:
         print(f"covariances that are none {nees['improper']}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
 
@@ -155,9 +156,10 @@ class Fix:
     """The answer for one frame: `T_dock_cam` (4, 4) when `valid`, otherwise no pose and a `reason`.
 
     `covariance` (6, 6) of [t_est - t_true, w], R_est = Exp(w) R_true, in dock axes, and `protection` come with a pose
-    from a method that knows them. `guide` is there when bearing and range may be used. `n_seen` counts the frame's
-    detections and `n_used` those behind the pose; `by_layer` holds what each layer said alone, where a method works by
-    layer.
+    from a method that knows them. `guide` is there when bearing and range may be used. `nis` is the normalised
+    innovation squared of a tracked frame over its degrees of freedom, 1 on average where noise is as stated; NaN
+    without history. `n_seen` counts the frame's detections and `n_used` those behind the pose; `by_layer` holds what
+    each layer said alone, where a method works by layer.
     """
 
     frame: str
@@ -173,6 +175,7 @@ class Fix:
     covariance: Array | None = None
     protection: Protection | None = None
     guide: Guide | None = None
+    nis: float = math.nan
 
     def __post_init__(self) -> None:
         if (self.T_dock_cam is None) != bool(self.reason):

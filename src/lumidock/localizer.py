@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -224,6 +225,7 @@ class Localizer:
             covariance=bound.covariance if valid else None,
             protection=bound.protection if valid else None,
             guide=bound.guide if proven and integrity.guide_holds(bound) else None,
+            nis=first.nis / (2 * first.n_used) if status == "tracking" else math.nan,
         )
 
     def _coast(self, detections: Detections, reason: str) -> Fix:

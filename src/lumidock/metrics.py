@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -58,6 +59,7 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
         "continuity": gaps,
     }
     result["availability"] = _shares(result)
+    result["nis"] = _nis(run_folder)
     result |= _judge(path, [row for row in fixes if row["frame"] in true], true)
     if (run_folder / "layers.csv").exists():
         result["layers"] = _layers(run_folder, true)
@@ -66,6 +68,16 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
     if all((run_folder / name).exists() for name in ("lights.csv", "station.yaml", "camera.yaml")):
         result["residual_rms_px"] = _residual_rms_px(run_folder, poses)
     return result
+
+
+def _nis(run_folder: Path) -> dict[str, float] | None:
+    """Mean innovation squared per degree of freedom, over the tracked frames, as the run has summed it up."""
+    try:
+        content = json.loads((run_folder / "run.json").read_text(encoding="utf-8"))
+        nis = content["counts"]["nis"]
+        return None if nis is None else {"frames": int(nis["frames"]), "mean": float(nis["mean"])}
+    except (OSError, ValueError, KeyError, TypeError):  # a run of another program
+        return None
 
 
 def _judge(path: Path, fixes: list[Row], true: dict[str, Array]) -> dict[str, Any]:

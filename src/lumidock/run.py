@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -43,6 +44,7 @@ class Summary:
     status: Counter[str] = field(default_factory=Counter)
     stage: Counter[str] = field(default_factory=Counter)
     reason: Counter[str] = field(default_factory=Counter)
+    nis: list[float] = field(default_factory=list)
     latency_us: list[int] = field(default_factory=list)
     first_error: str = ""
     finished: bool = False
@@ -58,6 +60,8 @@ class Summary:
         self.stage[fix.stage] += fix.valid
         self.reason[fix.reason] += bool(fix.reason)
         self.first_error = self.first_error or error
+        if math.isfinite(fix.nis):
+            self.nis.append(fix.nis)
         if latency_us is not None:
             self.latency_us.append(latency_us)
 
@@ -74,6 +78,7 @@ class Summary:
             "status": dict(self.status),
             "valid_by_stage": {name: count for name, count in self.stage.items() if count},
             "reason": {name: count for name, count in self.reason.items() if count},
+            "nis": {"frames": len(self.nis), "mean": sum(self.nis) / len(self.nis)} if self.nis else None,
             "latency_us": latency,
             "finished": self.finished,
         }
