@@ -82,7 +82,7 @@ class Localizer:
             return self._conclude(detections, "tracking")
         self._failures += 1
         if self.locked and followed and not held and self._failures == 1:
-            return self._coast(detections, "residual")  # one frame in many thousands fails by chance
+            return self._coast(detections, self._doubt(followed, seen))  # one in many thousands fails by chance
         found = self._acquire(detections, seen)
         if held and not track.is_joint(
             verify.names_of(found, self.config.match, len(self.station)), self._plan, self.config.track
@@ -94,7 +94,7 @@ class Localizer:
         if verify.is_answer(found, self.config.match) and self._lock(found, detections, seen):
             return self._conclude(detections, "acquired")
         if self.locked:
-            return self._coast(detections, "residual" if followed else _why(detections, found))
+            return self._coast(detections, self._doubt(followed, seen) or _why(detections, found))
         if not self.cold and self._gather(followed, found, detections, seen):
             return self._conclude(detections, "acquired")
         return self._no_fix(detections, "none", _why(detections, found))
@@ -146,14 +146,23 @@ class Localizer:
         return kept
 
     def _holds(self, belief: Track, seen: Spots) -> bool:
-        """Whether a followed belief passes its innovation test and leaves no array's worth of spots unexplained.
+        """Whether a followed belief passes its tests, with lights enough.
 
         Three lights of one plane fit many poses: only a track that has seen two layers lives on less than four.
         """
-        enough = belief.n_used >= (1 if belief.joint else _MIN_SOLID)
+        return belief.n_used >= (1 if belief.joint else _MIN_SOLID) and self._fits(belief, seen)
+
+    def _fits(self, belief: Track, seen: Spots) -> bool:
+        """Whether a followed belief passes its innovation test and leaves no array's worth of spots unexplained."""
         unexplained = seen.lamps - belief.n_used
         explains = belief.n_used >= _MIN_LIGHTS or unexplained < _MIN_SOLID
-        return enough and explains and verify.innovation_holds(belief, self.config.track)
+        return explains and verify.innovation_holds(belief, self.config.track)
+
+    def _doubt(self, followed: list[Track], seen: Spots) -> str:
+        """The word for followed beliefs that do not hold: `too_few` where nothing speaks against what is seen."""
+        if not followed:
+            return ""
+        return "too_few" if self._fits(followed[0], seen) else "residual"
 
     def _overlooks(self, belief: Track, seen: Spots) -> bool:
         """Whether a second layer may be in view where the tilt was too open, or too wrong, to expect it there."""
