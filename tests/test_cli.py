@@ -176,7 +176,7 @@ def test_pictures_from_simulation_to_evaluation(lumidock, tmp_path):
 
 def test_a_video_is_run(lumidock, tmp_path):
     write_video(tmp_path / "dive.mp4")
-    save_camera(cli.load_camera(cli._shipped_or_path("camera", "imx264-60deg")), tmp_path / "camera.yaml")
+    save_camera(cli.load_camera(cli.shipped_or_path("camera", "imx264-60deg")), tmp_path / "camera.yaml")
     text = (tmp_path / "camera.yaml").read_text().replace("2448", "32").replace("2048", "24")
     (tmp_path / "camera.yaml").write_text(text)
     words = ("--camera", tmp_path / "camera.yaml", "--station", "cage-2x2x5", "--out", tmp_path / "run")

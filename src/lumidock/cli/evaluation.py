@@ -1,0 +1,68 @@
+"""An evaluation as text."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def print_evaluation(result: dict[str, Any]) -> None:
+    """The evaluation as text: one line a topic, one row a range."""
+    print(
+        f"valid {result['valid']} of {_share(result, 'valid')}, guide {result['guide']} of {_share(result, 'guide')}; "
+        f"not valid: {_words(result['reasons'])}"
+    )
+    for word, gaps in result["continuity"].items():
+        if gaps["longest_gap_s"] is not None:
+            print(f"longest gap in {word} {gaps['longest_gap_s']:.2f} s; gaps over 0.45 s: {gaps['long_gaps']}")
+    if result["error"]:
+        _print_ranges(result)
+    for layer, content in result.get("layers", {}).items():
+        if isinstance(content, dict):
+            print(f"{layer}: {content['fixes']} fixes, z {content['first_z_m']:.2f} to {content['last_z_m']:.2f} m")
+        elif content is not None:
+            print(f"largest offset between the layers {content:.3f} m")
+    if "labels" in result:
+        print(f"names: {result['labels']['named']} given, {result['labels']['wrong']} wrong")
+    if result.get("residual_rms_px") is not None:
+        print(f"named lights {result['residual_rms_px']:.2f} px rms from where the poses put them")
+    _print_trust(result)
+
+
+def _print_ranges(result: dict[str, Any]) -> None:
+    print(f"{'z, m':>12} {'frames':>7} {'valid':>6} {'guide':>6}", end="   ")
+    print("lateral m       axial m         angle deg   (median / 95 %)")
+    for row in [*result["by_true_z"], {"z_m": None, **result, **result["error"]}]:
+        where = "all" if row["z_m"] is None else f"{row['z_m'][0]:g}..{row['z_m'][1]:g}"
+        errors = (row.get(name) for name in ("lateral_m", "axial_m", "angle_deg"))
+        cells = "  ".join(f"{e['median']:6.3f} /{e['p95']:7.3f}" if e else f"{'-':>15}" for e in errors)
+        print(f"{where:>12} {row['frames']:7d} {row['valid']:6d} {row['guide']:6d}   {cells}")
+
+
+def _print_trust(result: dict[str, Any]) -> None:
+    """What the run's own claims are worth."""
+    hazardous = result["hazardous"]
+    for word in ("valid", "guide"):
+        kinds = {kind: count for kind, count in hazardous[word].items() if kind != "any"}
+        print(f"{word} but over the alert limit {hazardous[word]['any']} of {hazardous['frames']} frames", end="")
+        print(f": {_words(kinds)}" if any(kinds.values()) else "")
+    levels = {kind: f"{row['over']} of {row['frames']}" for kind, row in result["over_level"].items() if row["frames"]}
+    if levels:
+        print(f"error over the protection level: {_words(levels)}")
+    nees = result["nees"]
+    if nees["frames"]:
+        stages = {stage: f"{mean['mean']:.2f}" for stage, mean in nees["by_stage"].items()}
+        print(f"NEES {nees['mean']:.2f} over {nees['frames']} frames, honest is 6: {_words(stages)}")
+    if nis := result["nis"]:
+        print(f"NIS per degree of freedom {nis['mean']:.2f} over {nis['frames']} frames, honest is 1")
+    if nees["improper"]:
+        print(f"covariances that are none {nees['improper']}")
+
+
+def _words(counts: dict[str, Any]) -> str:
+    return ", ".join(f"{word} {count}" for word, count in counts.items()) or "none"
+
+
+def _share(result: dict[str, Any], word: str) -> str:
+    """The frames of an evaluation, and which share of them is meant."""
+    share = result["availability"][word]
+    return f"{result['frames']} frames" + (f" ({100.0 * share:.1f} %)" if share is not None else "")
