@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import numpy as np
 import yaml
@@ -25,6 +25,7 @@ _COEFFICIENTS: dict[str, tuple[int, ...]] = {
     "rational_polynomial": (8,),
     "equidistant": (4,),
 }
+_MODELS, _MAX_SIDE_PX = ", ".join(_COEFFICIENTS), 32768
 _FOLD_MARGIN, _FOLD_STEPS = 0.999, 10_000
 _NEWTON_STEPS = 40
 _NEWTON_TOLERANCE, _NEWTON_ACCEPTED = 1e-10, 1e-9  # in normalised image units: 2e-7, 2e-6 px at f = 2000 px
@@ -269,8 +270,8 @@ class _CameraInfo(BaseModel):
     """The part of ROS camera_info that lumidock reads; its other keys are let pass."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
-    image_width: Annotated[int, Field(gt=0, le=32768)]
-    image_height: Annotated[int, Field(gt=0, le=32768)]
+    image_width: Annotated[int, Field(gt=0, le=_MAX_SIDE_PX)]
+    image_height: Annotated[int, Field(gt=0, le=_MAX_SIDE_PX)]
     camera_matrix: _Matrix
     distortion_model: DistortionModel
     distortion_coefficients: _Matrix
@@ -282,18 +283,34 @@ def load_camera(path: Path) -> Camera:
     Raises: InputError, one line, for what is missing, not finite, of the wrong length or not supported.
     """
     info = validate(_CameraInfo, read_mapping(path), str(path))
-    if len(info.camera_matrix.data) != 9:
-        raise InputError(f"{path}: camera_matrix: wanted 9 numbers")
-    K = np.array(info.camera_matrix.data).reshape(3, 3)
+    size = info.image_width, info.image_height
+    return camera_from(
+        str(path), size, info.camera_matrix.data, info.distortion_model, info.distortion_coefficients.data
+    )
+
+
+def camera_from(origin: str, size: tuple[int, int], matrix: list[float], model: str, distortion: list[float]) -> Camera:
+    """Camera of the numbers of a calibration: `size` (width, height) px, `matrix` row by row.
+
+    Raises: InputError, one line that names `origin`, for what is not finite, of the wrong length or not supported.
+    """
+    if model not in _COEFFICIENTS:
+        raise InputError(f"{origin}: distortion model {model[:40]!r} is not supported; there are {_MODELS}")
+    if not all(0 < side <= _MAX_SIDE_PX for side in size):
+        raise InputError(f"{origin}: an image of {size[0]}x{size[1]} pixels")
+    if len(matrix) != 9:
+        raise InputError(f"{origin}: camera_matrix: wanted 9 numbers")
+    K = np.array(matrix).reshape(3, 3)
+    if not (np.isfinite(K).all() and np.isfinite(distortion).all()):
+        raise InputError(f"{origin}: not all numbers are finite")
     if K[0, 0] <= 0 or K[1, 1] <= 0 or K[0, 1] != 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
-        raise InputError(f"{path}: camera_matrix: wanted [fx, 0, cx, 0, fy, cy, 0, 0, 1] with positive fx and fy")
-    distortion = np.array(info.distortion_coefficients.data)
-    if len(distortion) not in _COEFFICIENTS[info.distortion_model]:
-        wanted = " or ".join(map(str, _COEFFICIENTS[info.distortion_model]))
-        raise InputError(f"{path}: distortion_coefficients: {info.distortion_model} takes {wanted} numbers")
-    camera = Camera(info.image_width, info.image_height, K, info.distortion_model, distortion)
+        raise InputError(f"{origin}: camera_matrix: wanted [fx, 0, cx, 0, fy, cy, 0, 0, 1] with positive fx and fy")
+    if len(distortion) not in _COEFFICIENTS[model]:
+        wanted = " or ".join(map(str, _COEFFICIENTS[model]))
+        raise InputError(f"{origin}: distortion_coefficients: {model} takes {wanted} numbers")
+    camera = Camera(*size, K, cast("DistortionModel", model), np.array(distortion))
     if camera._fold == 0.0:
-        raise InputError(f"{path}: distortion_coefficients: no lens bends light like this")
+        raise InputError(f"{origin}: distortion_coefficients: no lens bends light like this")
     return camera
 
 

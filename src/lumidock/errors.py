@@ -1,5 +1,10 @@
 """What lumidock raises on purpose: one line of text each, fit to be shown to a person."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class LumidockError(Exception):
     """Base class of every error lumidock raises on purpose."""
@@ -15,3 +20,14 @@ class FrameError(LumidockError):
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
         self.reason = reason
+
+
+@contextmanager
+def extra(name: str) -> Iterator[None]:
+    """Import an optional library within this. Raises: InputError that names the extra when it is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("lumidock"):
+            raise
+        raise InputError(f"{error.name} is not installed; pip install 'lumidock[{name}]'") from None

@@ -14,26 +14,33 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import cv2
 import typer
 
-from lumidock.camera import Camera, load_camera
+from lumidock.camera import Camera, load_camera, save_camera
+from lumidock.cli import inspection
 from lumidock.cli.evaluation import print_evaluation
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
     SCENARIOS,
+    SIM,
     AsJson,
+    Bits,
     CameraOption,
     Force,
+    Fps,
     Out,
     Seed,
     StationOption,
+    Topic,
     app,
     copy,
+    example,
     file_of,
     interrupts_held,
     prepare_folder,
     prepare_sequence,
     progress_bar,
     shipped_or_path,
+    simulated,
 )
 from lumidock.config import Config, load_config
 from lumidock.datatypes import Fix
@@ -45,6 +52,9 @@ if TYPE_CHECKING:
     from lumidock.run import TwoDoors
 
 _MAX_SEED = 10**9
+
+
+_COMMANDS = (inspection,)  # importing them adds their commands
 
 
 def main() -> None:
@@ -103,19 +113,31 @@ def _lumidock(
         print(context.get_help())
 
 
-@app.command("run")
+@app.command(
+    "run",
+    epilog=example(
+        "lumidock run SEQ --out RUN",
+        "lumidock run dive.mcap --station dock.yaml --out RUN",
+        "lumidock run dive.mp4 --station dock.yaml --camera camera.yaml --out RUN",
+        "lumidock run sim:approach --out RUN",
+    ),
+)
 def _run(
     source: Annotated[
-        Path, typer.Argument(metavar="SOURCE", help="Sequence folder, image folder (with --fps) or video file.")
+        str,
+        typer.Argument(
+            metavar="SOURCE",
+            help="Sequence or image folder, video file, bag of ROS 1 or ROS 2, or sim:SCENARIO[:SEED].",
+        ),
     ],
     out: Out,
     station: StationOption = None,
     camera: CameraOption = None,
     method: Annotated[str, typer.Option(metavar="NAME", help="lumidock, or paper.")] = "lumidock",
     cold: Annotated[bool, typer.Option("--cold", help="Forget all history before each frame.")] = False,
-    fps: Annotated[
-        float | None, typer.Option(metavar="F", help="Frames per second, for sources without time stamps.")
-    ] = None,
+    topic: Topic = None,
+    bits: Bits = 16,
+    fps: Fps = None,
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="YAML file of settings that differ from the defaults.")
     ] = None,
@@ -127,15 +149,26 @@ def _run(
     from lumidock.run import run as run_source
     from lumidock.streams.runfolder import RunFolder
 
-    opened = open_source(source, fps)
+    if source.startswith(SIM):
+        prepare_folder(out, force)
+        path, force = simulated(source, out / "sequence", station, camera), True
+    else:
+        path = Path(source)
+    gray = station is not None and set(load_station(shipped_or_path("station", station)).color) == {"white"}
+    opened = open_source(path, fps, topic=topic, bits=bits, gray=gray)
     station_file = file_of("station", station, opened.station, opened)
-    camera_file = file_of("camera", camera, opened.camera, opened)
+    described = camera is None and opened.camera is None and opened.calibration is not None
+    camera_file = out / "camera.yaml" if described else file_of("camera", camera, opened.camera, opened)
     settings = load_config(config) if config else Config()
     dock = load_station(station_file)
-    localizer = _localizer(method, dock, load_camera(camera_file), settings, cold)
-    if out.is_dir() and source.is_dir() and out.samefile(source):
+    lens = opened.calibration if described and opened.calibration else load_camera(camera_file)
+    localizer = _localizer(method, dock, lens, settings, cold)
+    if out.is_dir() and path.is_dir() and out.samefile(path):
         raise InputError(f"{out}: is the source; write the run elsewhere")
     prepare_folder(out, force)
+    if described:
+        camera_file.unlink(missing_ok=True)  # a link, not what it points to
+        save_camera(lens, camera_file)
     setup = Setup(method, cold, settings, station_file, camera_file)
     with RunFolder(out, dock.ids) as folder, progress_bar("run") as progress, interrupts_held() as let_interrupt:
         copy(station_file, out / "station.yaml")

@@ -22,11 +22,14 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from lumidock.camera import load_camera
 from lumidock.errors import InputError
+from lumidock.station import load_station
 from lumidock.streams.sources import Source
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
+SIM = "sim:"
 DEFAULT_STATION, DEFAULT_CAMERA = "cage-2x2x5", "imx264-60deg"
 _SIMULATED = ("frames", "detections.csv", "timestamps.csv", "lights_truth.csv", "spurious_truth.csv")
 
@@ -42,6 +45,16 @@ StationOption = Annotated[
 ]
 CameraOption = Annotated[
     str | None, typer.Option("--camera", metavar="FILE", help="camera_info file, or the name of a shipped one.")
+]
+Topic = Annotated[str | None, typer.Option("--topic", metavar="NAME", help="The pictures of a bag that has several.")]
+Bits = Annotated[
+    int,
+    typer.Option(
+        "--bits", metavar="N", min=8, max=16, help="How many bits of 16-bit pixels count: 12 of a 12-bit camera."
+    ),
+]
+Fps = Annotated[
+    float | None, typer.Option("--fps", metavar="F", help="Frames per second, for sources without time stamps.")
 ]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from it.")]
 
@@ -96,6 +109,23 @@ def prepare_sequence(folder: Path, force: bool) -> None:
     truth.write_bytes(b"")  # marks the folder as simulated, also when the simulation is cut short
 
 
+def simulated(source: str, folder: Path, station: str | None, camera: str | None) -> Path:
+    """The sequence folder that `sim:SCENARIO[:SEED]` stands for, simulated into `folder`. Raises: InputError."""
+    from lumidock.sim.scenario import load_scenario
+    from lumidock.sim.sequence import write_rendered
+
+    name, colon, seed = source.removeprefix(SIM).rpartition(":")
+    name, seed = (name, seed) if colon and seed.isdecimal() else (source.removeprefix(SIM), "0")
+    scenario = load_scenario(name, ())
+    station_file = shipped_or_path("station", station or DEFAULT_STATION)
+    dock, lens = load_station(station_file), load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))
+    prepare_sequence(folder, True)
+    copy(station_file, folder / "station.yaml")
+    with progress_bar("sim") as progress:
+        write_rendered(scenario, dock, lens, int(seed), folder, progress=progress)
+    return folder
+
+
 @contextmanager
 def interrupts_held() -> Iterator[Callable[[], None]]:
     """Hold Ctrl-C, but not a second one, until the callback that this yields: compiled code cannot be left half-way."""
@@ -132,3 +162,8 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int | None], None]]:
     with Progress(TextColumn("{task.description}"), *columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def example(*lines: str) -> str:
+    """The end of a command's help: commands to type."""
+    return "\n\n".join(["Examples:", *lines])

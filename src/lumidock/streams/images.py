@@ -15,7 +15,7 @@ from lumidock.errors import FrameError
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 _MAX_BYTES = 1 << 28
-_MAX_PIXELS = 100_000_000
+MAX_PIXELS = 100_000_000
 _PNG = b"\x89PNG\r\n\x1a\n"
 _SIZE_MARKERS, _SCAN = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}, 0xDA
 _END = b"\xff\xd9"
@@ -36,8 +36,13 @@ def read_image(path: Path) -> Image:
         data = path.read_bytes()
     except OSError as error:
         raise _bad(path, error.strerror or "cannot be read") from None
+    return decode_image(data, path)
+
+
+def decode_image(data: bytes, path: object) -> Image:
+    """The picture in the bytes of a PNG or JPEG; `path` is what an error calls it. Raises: as `read_image`."""
     width, height = _size_in_header(path, data)
-    if not 0 < width * height <= _MAX_PIXELS:
+    if not 0 < width * height <= MAX_PIXELS:
         raise _bad(path, f"{width}x{height} pixels")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -60,11 +65,11 @@ def _is_gray(image: Image, tint: int) -> bool:
     return max(int(cv2.absdiff(blue, green).max()), int(cv2.absdiff(green, red).max())) <= tint
 
 
-def _bad(path: Path, why: str) -> FrameError:
+def _bad(path: object, why: str) -> FrameError:
     return FrameError("bad_frame", f"{path}: {why}")
 
 
-def _size_in_header(path: Path, data: bytes) -> tuple[int, int]:
+def _size_in_header(path: object, data: bytes) -> tuple[int, int]:
     if data.startswith(_PNG):
         return _png_size(path, data)
     if data.startswith(b"\xff\xd8"):
@@ -72,7 +77,7 @@ def _size_in_header(path: Path, data: bytes) -> tuple[int, int]:
     raise _bad(path, "empty file" if not data else "neither PNG nor JPEG")
 
 
-def _png_size(path: Path, data: bytes) -> tuple[int, int]:
+def _png_size(path: object, data: bytes) -> tuple[int, int]:
     """Width and height from the header chunk, after a check of every chunk up to the last. Source: ISO 15948, 5.3."""
     at, view = len(_PNG), memoryview(data)
     while at + 12 <= len(data):
@@ -87,7 +92,7 @@ def _png_size(path: Path, data: bytes) -> tuple[int, int]:
     raise _bad(path, "truncated PNG")
 
 
-def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
+def _jpeg_size(path: object, data: bytes) -> tuple[int, int]:
     """Width and height from the start-of-frame segment; the scan must have an end. Source: ITU-T T.81, B.1, B.2."""
     at, size = 2, (0, 0)
     while at + 9 <= len(data) and data[at] == 0xFF and data[at + 1] != _SCAN:

@@ -9,19 +9,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from lumidock.camera import Camera
 from lumidock.datatypes import Array, Attitude, Detections, Frame, Unusable
-from lumidock.errors import FrameError, InputError
+from lumidock.errors import FrameError, InputError, extra
 from lumidock.geometry import rotation_from_quat_xyzw
-from lumidock.streams.images import SUFFIXES, mono_if_gray, read_image
+from lumidock.streams.images import SUFFIXES, read_image
 
 Item = Frame | Detections | Unusable
 _VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg", ".ts", ".wmv")
+BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 _INTEGER, _MAX_STAMP = re.compile(r"[+-]?[0-9]{1,19}"), 2**63 - 1
 _FPS_RANGE = (1e-3, 1e6)
-_VIDEO_TINT = 4  # grey levels; decoded gray is off by up to 3
 _ATTITUDE_COLUMNS = ("t_ns", "qx", "qy", "qz", "qw", "sigma_rad")
 _ATTITUDE_REACH_NS = 100_000_000  # a row holds for frames this near to it
 _MAX_ATTITUDE_NUMBER = 1e9  # of a quaternion that may have any length
@@ -34,7 +34,8 @@ Row = dict[str, str]
 class Source:
     """An opened source: `items()` iterates over its frames from the start; `count` is how many, if known.
 
-    `camera` and `station` are files found beside the frames, `inputs` the files whose hashes identify the source.
+    `camera` and `station` are files found beside the frames, `calibration` the camera that a bag describes, `inputs`
+    the files whose hashes identify the source.
     """
 
     path: Path
@@ -44,29 +45,47 @@ class Source:
     camera: Path | None = None
     station: Path | None = None
     inputs: tuple[Path, ...] = ()
+    calibration: Camera | None = None
 
 
-def open_source(path: Path, fps: float | None = None) -> Source:
-    """Open a sequence folder, an image folder (needs `fps`) or a video file.
+def open_source(
+    path: Path, fps: float | None = None, *, topic: str | None = None, bits: int = 16, gray: bool = False
+) -> Source:
+    """Open a sequence folder, an image folder (needs `fps`), a video file or a bag of ROS 1 or ROS 2.
 
-    Raises: InputError, one line, when there is nothing to read.
+    `topic` chooses the pictures of a bag, whose 16-bit pixels have `bits` that count; `gray` says that colour is not
+    needed. Raises: InputError, one line, when there is nothing to read.
     """
     if fps is not None and not _FPS_RANGE[0] <= fps <= _FPS_RANGE[1]:
         raise InputError(f"--fps {fps:g}: wanted a frame rate from {_FPS_RANGE[0]:g} to {_FPS_RANGE[1]:g}")
-    if path.is_dir():
-        return _open_folder(path, fps)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
+    if path.suffix.lower() in BAG_SUFFIXES or (path.is_dir() and _holds_a_bag(path)):
+        with extra("bag"):
+            from lumidock.streams.bag import open_bag
+        return open_bag(path, topic, bits)
+    if path.is_dir():
+        return _open_folder(path, fps)
     if path.suffix.lower() in _VIDEO_SUFFIXES:
-        return _open_video(path, fps)
-    raise InputError(f"{path}: neither a folder nor a video ({', '.join(_VIDEO_SUFFIXES)})")
+        with extra("video"):
+            from lumidock.streams.video import open_video
+        return open_video(path, fps, gray)
+    kinds = ", ".join((*_VIDEO_SUFFIXES, *BAG_SUFFIXES))
+    raise InputError(f"{path}: neither a folder nor a video or bag ({kinds})")
+
+
+def _holds_a_bag(folder: Path) -> bool:
+    """Whether a recorder of bags made this folder; frames of a sequence come first."""
+    if (folder / "timestamps.csv").exists():
+        return False
+    return any(file.suffix.lower() in BAG_SUFFIXES for file in folder.iterdir())
 
 
 def _open_folder(path: Path, fps: float | None) -> Source:
     camera, station = (file if file.exists() else None for file in (path / "camera.yaml", path / "station.yaml"))
     if (path / "timestamps.csv").exists():
         return _open_sequence(path, camera, station)
-    pictures = sorted((file for file in path.iterdir() if file.suffix.lower() in SUFFIXES), key=_in_natural_order)
+    pictures = sorted((file for file in path.iterdir() if file.suffix.lower() in SUFFIXES), key=in_natural_order)
     if not pictures:
         raise InputError(f"{path}: neither timestamps.csv nor any PNG or JPEG in it")
     if fps is None:
@@ -221,7 +240,7 @@ def _frame_detections(name: str, t_ns: int, rows: list[Row], attitude: Attitude 
     return Detections(name, t_ns, uv, radius_px, flux, p_light, p_rear, attitude=attitude)
 
 
-def _in_natural_order(file: Path) -> list[str | int]:
+def in_natural_order(file: Path) -> list[str | int]:
     """Sorting key that puts picture 2 before picture 10."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.name)]
 
@@ -233,33 +252,3 @@ def _pictures(files: list[Path], fps: float) -> Iterator[Item]:
             yield Frame(file.stem, t_ns, read_image(file))
         except FrameError as error:
             yield Unusable(file.stem, t_ns, error.reason, str(error))
-
-
-def _open_video(path: Path, fps: float | None) -> Source:
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    try:
-        if not capture.grab():
-            raise InputError(f"{path}: not a video that can be decoded")
-        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    finally:
-        capture.release()
-    return Source(path, "video", lambda: _video(path, fps), count if count > 0 else None, inputs=(path,))
-
-
-def _video(path: Path, fps: float | None) -> Iterator[Item]:
-    """Decoded frames with the container's own presentation times, unless `fps` overrides them."""
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    try:
-        number = 0
-        while capture.grab():
-            ms = capture.get(cv2.CAP_PROP_POS_MSEC)
-            t_ns = round(number * 1e9 / fps) if fps else round(ms * 1e6)
-            decoded, image = capture.retrieve()
-            name = f"{number:06d}"
-            if decoded:
-                yield Frame(name, t_ns, mono_if_gray(np.asarray(image, np.uint8), tint=_VIDEO_TINT))
-            else:
-                yield Unusable(name, t_ns, "bad_frame", f"frame {name}: cannot be decoded")
-            number += 1
-    finally:
-        capture.release()

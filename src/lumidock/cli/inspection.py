@@ -1,0 +1,81 @@
+"""`lumidock inspect`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lumidock.camera import Camera, load_camera
+from lumidock.cli.shared import AsJson, CameraOption, Fps, Topic, app, example, progress_bar, shipped_or_path
+from lumidock.errors import extra
+from lumidock.streams.sources import Source, open_source
+
+
+@app.command(
+    "inspect", epilog=example("lumidock inspect dive.mcap", "lumidock inspect SEQ --camera camera.yaml --json")
+)
+def _inspect(
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="Sequence or image folder, video file, or bag of ROS 1 or ROS 2.")
+    ],
+    camera: CameraOption = None,
+    topic: Topic = None,
+    fps: Fps = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show sizes, rates, gaps and exposure of SOURCE."""
+    from lumidock.streams.inspection import inspect
+
+    opened = open_source(source, fps, topic=topic)
+    with progress_bar("inspect") as progress:
+        result = inspect(opened, _calibration(camera, opened), progress=progress)
+    if opened.kind == "bag":
+        with extra("bag"):
+            from lumidock.streams.bag import topics_of
+        result["topics"] = [{"name": t.name, "type": t.type, "messages": t.count} for t in topics_of(source)]
+    if as_json:
+        print(json.dumps(result, indent=1))
+    else:
+        _print(result)
+
+
+def _calibration(given: str | None, source: Source) -> Camera | None:
+    if given is not None:
+        return load_camera(shipped_or_path("camera", given))
+    return load_camera(source.camera) if source.camera is not None else source.calibration
+
+
+def _print(result: dict[str, Any]) -> None:
+    for topic in result.get("topics", ()):
+        print(f"topic       {topic['name']}  {topic['type']}  {topic['messages']} messages")
+    print(f"frames      {result['frames']} ({result['kind']})")
+    for size in result["sizes"]:
+        print(f"size        {size['width']} x {size['height']} {size['kind']}, {size['frames']} frames")
+    if result["unusable"]:
+        words = ", ".join(f"{word} {count}" for word, count in result["unusable"].items())
+        print(f"unusable    {words}; first: {result['first_problem']}")
+    _print_fit(result["calibration"])
+    time, exposure = result["time"], result["exposure"]
+    if time["rate_hz"] is not None:
+        print(f"time        {time['span_s']:.3f} s at {time['rate_hz']:.2f} Hz, jitter {time['jitter_ms']:.2f} ms")
+        print(
+            f"gaps        {time['gaps']}, longest {time['longest_gap_s']:.3f} s; {time['drops']} frames dropped, "
+            f"{time['out_of_order']} out of order"
+        )
+    if exposure["median_level"] is not None:
+        print(f"exposure    median level {exposure['median_level']:.0f}, {100 * exposure['saturated']:.2f} % saturated")
+
+
+def _print_fit(fit: dict[str, Any] | None) -> None:
+    if fit is None:
+        print("calibration none")
+    elif fit["frames_of_another_size"]:
+        print(
+            f"calibration of {fit['width']} x {fit['height']} does NOT fit {fit['frames_of_another_size']} frames; "
+            "calibrate at the size that is recorded"
+        )
+    else:
+        print(f"calibration of {fit['width']} x {fit['height']} fits")

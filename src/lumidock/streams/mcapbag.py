@@ -1,0 +1,169 @@
+"""Messages out of an MCAP file that may be cut short, damaged or hostile. Source: MCAP specification, mcap.dev."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Chunk, Schema
+from mcap.summary import Summary
+
+from lumidock.errors import InputError
+from lumidock.streams.ros import Broken, Message, Topic, ros2_type
+
+_MAGIC = b"\x89MCAP0\r\n"
+_MAX_RECORD = 1 << 28  # a chunk of 256 MiB holds ten raw pictures of 24 megapixels
+_HEAD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
+_LAST_OPCODE = int(Opcode.DATA_END)
+_DAMAGED = (McapError, ValueError, EOFError, struct.error, MemoryError, RuntimeError, KeyError, zstandard.ZstdError)
+
+
+def topics(path: Path) -> list[Topic]:
+    """Topics of an MCAP file, from its summary or, where a killed recorder left none, from all of it.
+
+    Raises: InputError when it is no MCAP file.
+    """
+    with path.open("rb") as file:
+        _check_magic(path, file)
+        summary = _summary(file)
+        if summary is None or not summary.channels:
+            return _count_topics(path, file)
+        counts = summary.statistics.channel_message_counts if summary.statistics else None
+        return [
+            Topic(channel.topic, ros2_type(schema.name), counts.get(number, 0) if counts is not None else None)
+            for number, channel in summary.channels.items()
+            if (schema := summary.schemas.get(channel.schema_id)) is not None
+        ]
+
+
+def messages(path: Path, wanted: Collection[str]) -> Iterator[Message | Broken]:
+    """Messages on the topics `wanted`, in the order of the file; what cannot be read is skipped and told.
+
+    Raises: InputError when it is no MCAP file.
+    """
+    with path.open("rb") as file:
+        _check_magic(path, file)
+        summary = _summary(file)
+        known, chunks = _Known(wanted), list[int]()
+        if summary is not None:  # the chunk that defines a channel may be the one that is damaged
+            chunks = sorted(index.chunk_start_offset for index in summary.chunk_indexes)
+            known.schemas = {number: ros2_type(schema.name) for number, schema in summary.schemas.items()}
+            known.channels = dict(summary.channels)
+        yield from _walk(path, file, chunks, known)
+
+
+@dataclass(slots=True)
+class _Known:
+    """Schemas and channels met so far, and the topics that are wanted; all of them when that is None."""
+
+    wanted: Collection[str] | None
+    schemas: dict[int, str] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+
+    def read(self, opcode: int, body: bytes) -> Message | None:
+        """The message of a record, if it is one; schemas and channels are kept."""
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(ReadDataStream(BytesIO(body)))
+            self.schemas[schema.id] = ros2_type(schema.name)
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(ReadDataStream(BytesIO(body)))
+            self.channels[channel.id] = channel
+        elif opcode == Opcode.MESSAGE:
+            number, _, log_ns, _ = _MESSAGE.unpack_from(body)
+            seen = self.channels.get(number)
+            if seen is not None and (self.wanted is None or seen.topic in self.wanted):
+                encoding = "ros1" if seen.message_encoding == "ros1" else "cdr"
+                kind = self.schemas.get(seen.schema_id, "")
+                return Message(seen.topic, kind, encoding, log_ns, body[_MESSAGE.size :])
+        return None
+
+
+def _check_magic(path: Path, file: BinaryIO) -> None:
+    file.seek(0)
+    if file.read(len(_MAGIC)) != _MAGIC:
+        raise InputError(f"{path}: not an MCAP file")
+
+
+def _summary(file: BinaryIO) -> Summary | None:
+    file.seek(0)
+    try:
+        return SeekingReader(file, record_size_limit=_MAX_RECORD).get_summary()
+    except (*_DAMAGED, OSError, TypeError):
+        return None
+
+
+def _count_topics(path: Path, file: BinaryIO) -> list[Topic]:
+    known, counts = _Known(None), dict[tuple[str, str], int]()
+    for message in _walk(path, file, [], known):
+        if isinstance(message, Message):
+            key = message.topic, message.type
+            counts[key] = counts.get(key, 0) + 1
+    return [Topic(name, kind, count) for (name, kind), count in counts.items()]
+
+
+def _walk(path: Path, file: BinaryIO, chunks: list[int], known: _Known) -> Iterator[Message | Broken]:
+    """Record by record; where one makes no sense, on from the next chunk that the summary lists."""
+    size = file.seek(0, 2)
+    at = len(_MAGIC)
+    while at < size:
+        file.seek(at)
+        head = file.read(_HEAD.size)
+        opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
+        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            return
+        end = at + _HEAD.size + length
+        if 0 < opcode < _LAST_OPCODE and length <= _MAX_RECORD and end <= size:
+            yield from _record(path, at, opcode, file.read(length), known)
+            at = end
+            continue
+        yield Broken(f"{path}: damaged or cut short at byte {at}")
+        at = next((start for start in chunks if start > at), size)
+
+
+def _record(path: Path, at: int, opcode: int, body: bytes, known: _Known) -> Iterator[Message | Broken]:
+    try:
+        inner = _unpacked(body) if opcode == Opcode.CHUNK else [(opcode, body)]
+        for kind, content in inner:
+            message = known.read(kind, content)
+            if message is not None:
+                yield message
+    except _DAMAGED as error:
+        yield Broken(f"{path}: chunk at byte {at}: {' '.join(str(error).split()) or type(error).__name__}")
+
+
+def _unpacked(body: bytes) -> Iterator[tuple[int, bytes]]:
+    """Records of a chunk, whose size and checksum are held against what it says of itself."""
+    chunk = Chunk.read(ReadDataStream(BytesIO(body)))
+    if chunk.uncompressed_size > _MAX_RECORD:
+        raise ValueError(f"claims {chunk.uncompressed_size} bytes")
+    data = _decompress(chunk.data, chunk.compression, chunk.uncompressed_size)
+    if len(data) != chunk.uncompressed_size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise ValueError("checksum or size does not fit")
+    at = 0
+    while at + _HEAD.size <= len(data):
+        opcode, length = _HEAD.unpack_from(data, at)
+        at += _HEAD.size
+        yield opcode, data[at : at + length]
+        at += length
+
+
+def _decompress(data: bytes, compression: str, size: int) -> bytes:
+    """At most `size` + 1 bytes of what `data` holds."""
+    if compression == "zstd":
+        return bytes(zstandard.ZstdDecompressor().stream_reader(data).read(size + 1))
+    if compression == "lz4":
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
+    if compression:
+        raise ValueError(f"compression {compression[:20]!r} is not supported")
+    return data
