@@ -15,7 +15,7 @@ import cv2
 import typer
 
 from lumidock.camera import Camera, load_camera, save_camera
-from lumidock.cli import inspection
+from lumidock.cli import exporting, inspection
 from lumidock.cli.evaluation import print_evaluation
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 _MAX_SEED = 10**9
 
 
-_COMMANDS = (inspection,)  # importing them adds their commands
+_COMMANDS = (inspection, exporting)  # importing them adds their commands
 
 
 def main() -> None:

@@ -46,6 +46,9 @@ StationOption = Annotated[
 CameraOption = Annotated[
     str | None, typer.Option("--camera", metavar="FILE", help="camera_info file, or the name of a shipped one.")
 ]
+VehicleOption = Annotated[
+    Path | None, typer.Option("--vehicle", metavar="FILE", help="Vehicle file: frame names and the camera's mounting.")
+]
 Topic = Annotated[str | None, typer.Option("--topic", metavar="NAME", help="The pictures of a bag that has several.")]
 Bits = Annotated[
     int,

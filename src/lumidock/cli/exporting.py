@@ -1,0 +1,50 @@
+"""`lumidock export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lumidock.cli.shared import Force, Topic, VehicleOption, app, example, interrupts_held, progress_bar
+from lumidock.errors import InputError
+from lumidock.streams.sources import open_source
+from lumidock.vehicle import load_vehicle
+
+
+@app.command(
+    "export",
+    epilog=example(
+        "lumidock export RUN fixes.mcap --source dive.mcap --vehicle vehicle.yaml",
+        "lumidock export RUN fixes.rrd --source SEQ",
+        "lumidock export RUN annotated.mp4 --source SEQ",
+        "lumidock export RUN fixes.parquet",
+    ),
+)
+def _export(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
+    target: Annotated[Path, typer.Argument(metavar="FILE", help="File ending in .mcap, .rrd, .mp4 or .parquet.")],
+    source: Annotated[
+        Path | None, typer.Option("--source", metavar="SOURCE", help="What RUN was made from, for its pictures.")
+    ] = None,
+    vehicle: VehicleOption = None,
+    topic: Topic = None,
+    fps: Annotated[float | None, typer.Option("--fps", metavar="F", help="As for the run.")] = None,
+    force: Force = False,
+) -> None:
+    """Turn RUN into a file for ROS 2, Rerun, video players or tables."""
+    from lumidock.export import export
+
+    if target.exists() and not force:
+        raise InputError(f"{target}: exists; give --force to replace it")
+    opened = open_source(source, fps, topic=topic) if source else None
+    mounting = load_vehicle(vehicle) if vehicle else None
+    with interrupts_held() as let_interrupt, progress_bar("export") as progress:
+
+        def on_frame(done: int, total: int | None) -> None:
+            progress(done, total)
+            let_interrupt()
+
+        frames = export(run, target, opened, mounting, progress=on_frame)
+    print(f"{frames} frames written to {target}")

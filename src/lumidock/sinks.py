@@ -1,0 +1,86 @@
+"""Where fixes go besides the run folder: a sink is opened by the name of its file or address."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from lumidock.camera import Camera
+from lumidock.datatypes import Detections, Fix, Frame, Image, Unusable
+from lumidock.errors import InputError, extra
+from lumidock.overlay import draw, whole
+from lumidock.station import Station
+from lumidock.vehicle import Vehicle
+
+FILE_KINDS = (".mcap", ".rrd", ".mp4")
+_WIDTH = 1224  # of an annotated video, px
+
+
+class Sink(Protocol):
+    """Takes one frame and its fix after the other."""
+
+    def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
+        """Take one frame. Raises: OSError when it cannot."""
+        ...
+
+    def close(self) -> None:
+        """Write what is left."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What every sink needs to know beside the fixes."""
+
+    station: Station
+    camera: Camera
+    vehicle: Vehicle | None = None
+
+
+def open_file_sink(path: Path, scene: Scene) -> Sink:
+    """A sink that writes `path`, whose ending says what it becomes. Raises: InputError for another ending."""
+    if path.suffix == ".mcap":
+        with extra("bag"):
+            from lumidock.streams.mcapfile import McapFile
+        return McapFile(path, scene.camera, scene.vehicle, scene.station.ids)
+    if path.suffix == ".rrd":
+        return open_rerun(str(path), scene)
+    if path.suffix == ".mp4":
+        with extra("video"):
+            from lumidock.streams.mp4 import Mp4
+        return _AnnotatedVideo(Mp4(path), scene)
+    raise InputError(f"{path}: not one of {', '.join(FILE_KINDS)}")
+
+
+def open_rerun(target: str, scene: Scene) -> Sink:
+    """A Rerun file, or the viewer at rerun+http://HOST:PORT/proxy."""
+    with extra("rerun"):
+        from lumidock.streams.rerunlog import RerunLog
+    return RerunLog(target, scene.station, scene.camera)
+
+
+class _Pictures(Protocol):
+    def add(self, picture: Image, t_ns: int) -> None: ...
+
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class _AnnotatedVideo:
+    video: _Pictures
+    scene: Scene
+
+    def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
+        """Draw one fix; frames without a picture leave the last one standing."""
+        del latency_us
+        if isinstance(item, Frame):
+            width = min(_WIDTH, item.image.shape[1])
+            view = whole(item.image, width)
+            picture = draw(item.image, fix, self.scene.station, self.scene.camera, view)
+            self.video.add(np.asarray(picture, np.uint8), item.t_ns)
+
+    def close(self) -> None:
+        self.video.close()

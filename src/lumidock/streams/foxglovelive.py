@@ -1,0 +1,58 @@
+"""Fixes to Foxglove, live, over a WebSocket of this machine."""
+
+from __future__ import annotations
+
+import foxglove
+from foxglove import Channel, Schema
+
+from lumidock.camera import Camera
+from lumidock.datatypes import Detections, Fix, Frame, Unusable
+from lumidock.streams import ros2
+from lumidock.vehicle import Vehicle
+
+_BACKLOG = 32  # messages that a client may be behind before the oldest are dropped
+
+
+class FoxgloveLive:
+    """A server that Foxglove connects to; a client that does not keep up loses messages, not we time."""
+
+    def __init__(
+        self, host: str, port: int, camera: Camera, vehicle: Vehicle | None, light_ids: tuple[str, ...]
+    ) -> None:
+        """Listen on `host`, `port`. Raises: OSError when that cannot be."""
+        self._context = foxglove.Context()
+        try:
+            self._server = foxglove.start_server(
+                name="lumidock", host=host, port=port, context=self._context, message_backlog_size=_BACKLOG
+            )
+        except (RuntimeError, OSError) as error:
+            raise OSError(f"{host}:{port}: {error}") from None
+        self._camera, self._vehicle, self._light_ids = camera, vehicle, light_ids
+        self._channels = {
+            topic: Channel(
+                topic,
+                schema=Schema(name=kind, encoding="ros2msg", data=ros2.definition(kind).encode()),
+                message_encoding="cdr",
+                context=self._context,
+            )
+            for topic, kind in ros2.TYPES.items()
+        }
+
+    @property
+    def port(self) -> int:
+        """The port that is listened on."""
+        return int(self._server.port)
+
+    def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
+        """Send one frame to whoever listens."""
+        if self._vehicle is not None and item.t_ns is not None:
+            self._send(ros2.mounting(self._vehicle, item.t_ns))
+        for message in ros2.messages(item, fix, latency_us, self._camera, self._vehicle, self._light_ids):
+            self._send(message)
+
+    def _send(self, message: ros2.Serialized) -> None:
+        self._channels[message.topic].log(message.data, log_time=max(message.t_ns, 0))
+
+    def close(self) -> None:
+        """Part from the clients."""
+        self._server.stop()

@@ -1,0 +1,55 @@
+"""Fixes into an MCAP file for ROS 2, Foxglove and Rerun."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from mcap.writer import CompressionType, Writer
+
+from lumidock.camera import Camera
+from lumidock.datatypes import Detections, Fix, Frame, Unusable
+from lumidock.streams import ros2
+from lumidock.vehicle import Vehicle
+
+_FLUSH_S = 0.5  # what a killed run may lose
+
+
+class McapFile:
+    """Writes every frame's messages; a file that was cut short can be read up to its last half second."""
+
+    def __init__(self, path: Path, camera: Camera, vehicle: Vehicle | None, light_ids: tuple[str, ...]) -> None:
+        """Start the file, replacing one that is there."""
+        self._file = path.open("wb")
+        self._writer = Writer(self._file, chunk_size=1 << 20, compression=CompressionType.LZ4)
+        self._writer.start("ros2", "lumidock")
+        self._camera, self._vehicle, self._light_ids = camera, vehicle, light_ids
+        self._channels: dict[str, int] = {}
+        self._flushed, self._mounted = time.monotonic(), vehicle is None
+
+    def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
+        """Append one frame. Raises: OSError when it cannot be written."""
+        if not self._mounted and item.t_ns is not None and self._vehicle is not None:
+            self._write(ros2.mounting(self._vehicle, item.t_ns))
+            self._mounted = True
+        for message in ros2.messages(item, fix, latency_us, self._camera, self._vehicle, self._light_ids):
+            self._write(message)
+        if time.monotonic() - self._flushed > _FLUSH_S:
+            self._writer.flush()
+            self._flushed = time.monotonic()
+
+    def _write(self, message: ros2.Serialized) -> None:
+        if message.topic not in self._channels:
+            kind = ros2.TYPES[message.topic]
+            schema = self._writer.register_schema(kind, "ros2msg", ros2.definition(kind).encode())
+            quality = {"offered_qos_profiles": ""}
+            self._channels[message.topic] = self._writer.register_channel(message.topic, "cdr", schema, quality)
+        t_ns = max(message.t_ns, 0)
+        self._writer.add_message(self._channels[message.topic], t_ns, message.data, t_ns)
+
+    def close(self) -> None:
+        """Write the summary and close the file."""
+        try:
+            self._writer.finish()
+        finally:
+            self._file.close()
