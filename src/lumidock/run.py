@@ -112,7 +112,7 @@ def run(
     stage: Stage = "search"
     try:
         for item in source.items():
-            fix, latency_us, error = _process(localizer, item, "search" if setup.cold else stage)
+            fix, latency_us, error = process(localizer, item, "search" if setup.cold else stage)
             stage = fix.stage
             folder.add(fix, latency_us, t_ns=item.t_ns)
             summary.count(fix, latency_us, error)
@@ -125,7 +125,7 @@ def run(
     return summary
 
 
-def _process(localizer: TwoDoors, item: Item, stage: Stage) -> tuple[Fix, int | None, str]:
+def process(localizer: TwoDoors, item: Item, stage: Stage) -> tuple[Fix, int | None, str]:
     """Fix of one item, its latency in microseconds, and what was wrong with it; `stage` holds while a frame is lost."""
     if isinstance(item, Unusable):
         return _unusable(item.frame, item.t_ns or 0, stage, item.reason), None, item.text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
@@ -13,6 +14,7 @@ from lumidock.datatypes import Detections, Fix, Frame, Image, Unusable
 from lumidock.errors import InputError, extra
 from lumidock.overlay import draw, whole
 from lumidock.station import Station
+from lumidock.streams.runfolder import RunFolder
 from lumidock.vehicle import Vehicle
 
 FILE_KINDS = (".mcap", ".rrd", ".mp4")
@@ -60,6 +62,38 @@ def open_rerun(target: str, scene: Scene) -> Sink:
     with extra("rerun"):
         from lumidock.streams.rerunlog import RerunLog
     return RerunLog(target, scene.station, scene.camera)
+
+
+class RunSink:
+    """A run folder as a sink, started once; what could not be written, on a full disk, is missing as whole rows."""
+
+    def __init__(self, folder: Path, light_ids: tuple[str, ...]) -> None:
+        self._folder = RunFolder(folder, light_ids)
+        self._folder.describe({"lumidock": version("lumidock"), "live": True})
+
+    def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
+        """Append one frame."""
+        self._folder.add(fix, latency_us, t_ns=item.t_ns)
+
+    def close(self) -> None:
+        """Nothing is held back, so there is nothing to do."""
+
+
+class Numbered:
+    """Opens FILE, and after a failure FILE-1, FILE-2, ..., so that what was written stays."""
+
+    def __init__(self, path: Path, scene: Scene) -> None:
+        self._path, self._scene, self._number, self._opened = path, scene, 0, False
+
+    def open(self) -> Sink:
+        """A sink of the first file that was not written to before."""
+        current = self._current()
+        self._number += self._opened and current.exists() and current.stat().st_size > 0
+        self._opened = True
+        return open_file_sink(self._current(), self._scene)
+
+    def _current(self) -> Path:
+        return self._path.with_stem(f"{self._path.stem}-{self._number}") if self._number else self._path
 
 
 class _Pictures(Protocol):

@@ -9,13 +9,13 @@ import sys
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import Annotated, NoReturn
 
 import cv2
 import typer
 
-from lumidock.camera import Camera, load_camera, save_camera
-from lumidock.cli import exporting, inspection
+from lumidock.camera import load_camera, save_camera
+from lumidock.cli import exporting, inspection, serving
 from lumidock.cli.evaluation import print_evaluation
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
@@ -25,17 +25,22 @@ from lumidock.cli.shared import (
     AsJson,
     Bits,
     CameraOption,
+    ConfigOption,
     Force,
     Fps,
+    Method,
     Out,
     Seed,
     StationOption,
     Topic,
     app,
+    calibration_of,
     copy,
     example,
     file_of,
     interrupts_held,
+    localizer_of,
+    open_any,
     prepare_folder,
     prepare_sequence,
     progress_bar,
@@ -45,16 +50,13 @@ from lumidock.cli.shared import (
 from lumidock.config import Config, load_config
 from lumidock.datatypes import Fix
 from lumidock.errors import InputError, LumidockError
-from lumidock.station import Station, load_station
+from lumidock.station import load_station
 from lumidock.streams.sources import Item, open_source
-
-if TYPE_CHECKING:
-    from lumidock.run import TwoDoors
 
 _MAX_SEED = 10**9
 
 
-_COMMANDS = (inspection, exporting)  # importing them adds their commands
+_COMMANDS = (inspection, exporting, serving)  # importing them adds their commands
 
 
 def main() -> None:
@@ -133,14 +135,12 @@ def _run(
     out: Out,
     station: StationOption = None,
     camera: CameraOption = None,
-    method: Annotated[str, typer.Option(metavar="NAME", help="lumidock, or paper.")] = "lumidock",
+    method: Method = "lumidock",
     cold: Annotated[bool, typer.Option("--cold", help="Forget all history before each frame.")] = False,
     topic: Topic = None,
     bits: Bits = 16,
     fps: Fps = None,
-    config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="YAML file of settings that differ from the defaults.")
-    ] = None,
+    config: ConfigOption = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -151,19 +151,16 @@ def _run(
 
     if source.startswith(SIM):
         prepare_folder(out, force)
-        path, force = simulated(source, out / "sequence", station, camera), True
-    else:
-        path = Path(source)
-    gray = station is not None and set(load_station(shipped_or_path("station", station)).color) == {"white"}
-    opened = open_source(path, fps, topic=topic, bits=bits, gray=gray)
+        source, force = str(simulated(source, out / "sequence", station, camera)), True
+    opened = open_any(source, fps, topic=topic, bits=bits, station=station)
     station_file = file_of("station", station, opened.station, opened)
     described = camera is None and opened.camera is None and opened.calibration is not None
     camera_file = out / "camera.yaml" if described else file_of("camera", camera, opened.camera, opened)
     settings = load_config(config) if config else Config()
     dock = load_station(station_file)
-    lens = opened.calibration if described and opened.calibration else load_camera(camera_file)
-    localizer = _localizer(method, dock, lens, settings, cold)
-    if out.is_dir() and path.is_dir() and out.samefile(path):
+    lens = calibration_of(camera, opened)
+    localizer = localizer_of(method, dock, lens, settings, cold)
+    if out.is_dir() and opened.path.is_dir() and out.samefile(opened.path):
         raise InputError(f"{out}: is the source; write the run elsewhere")
     prepare_folder(out, force)
     if described:
@@ -191,19 +188,6 @@ def _run(
     )
     if counts["reason"]:
         print("not valid: " + ", ".join(f"{word} {count}" for word, count in sorted(counts["reason"].items())))
-
-
-def _localizer(method: str, station: Station, camera: Camera, config: Config, cold: bool) -> TwoDoors:
-    """The method of that name. Raises: InputError for one that there is not, or a station that it cannot tell apart."""
-    if method == "lumidock":
-        from lumidock.localizer import Localizer
-
-        return Localizer(station, camera, config, cold=cold)
-    if method == "paper":
-        from lumidock.paper import PaperLocalizer
-
-        return PaperLocalizer(station, camera, config.paper, cold=cold)
-    raise InputError(f"--method {method}: no such method; there are lumidock and paper")
 
 
 @app.command("sim")

@@ -8,10 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from lumidock.camera import Camera, load_camera
-from lumidock.cli.shared import AsJson, CameraOption, Fps, Topic, app, example, progress_bar, shipped_or_path
+from lumidock.cli.shared import AsJson, CameraOption, Fps, Topic, app, calibration_of, example, progress_bar
 from lumidock.errors import extra
-from lumidock.streams.sources import Source, open_source
+from lumidock.streams.sources import open_source
 
 
 @app.command(
@@ -30,8 +29,9 @@ def _inspect(
     from lumidock.streams.inspection import inspect
 
     opened = open_source(source, fps, topic=topic)
+    known = camera is not None or opened.camera is not None or opened.calibration is not None
     with progress_bar("inspect") as progress:
-        result = inspect(opened, _calibration(camera, opened), progress=progress)
+        result = inspect(opened, calibration_of(camera, opened) if known else None, progress=progress)
     if opened.kind == "bag":
         with extra("bag"):
             from lumidock.streams.bag import topics_of
@@ -40,12 +40,6 @@ def _inspect(
         print(json.dumps(result, indent=1))
     else:
         _print(result)
-
-
-def _calibration(given: str | None, source: Source) -> Camera | None:
-    if given is not None:
-        return load_camera(shipped_or_path("camera", given))
-    return load_camera(source.camera) if source.camera is not None else source.calibration
 
 
 def _print(result: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -22,10 +22,15 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from lumidock.camera import load_camera
+from lumidock.camera import Camera, load_camera
+from lumidock.config import Config
 from lumidock.errors import InputError
-from lumidock.station import load_station
-from lumidock.streams.sources import Source
+from lumidock.station import Station, load_station
+from lumidock.streams.live import open_live
+from lumidock.streams.sources import Source, open_source
+
+if TYPE_CHECKING:
+    from lumidock.run import TwoDoors
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -50,6 +55,10 @@ VehicleOption = Annotated[
     Path | None, typer.Option("--vehicle", metavar="FILE", help="Vehicle file: frame names and the camera's mounting.")
 ]
 Topic = Annotated[str | None, typer.Option("--topic", metavar="NAME", help="The pictures of a bag that has several.")]
+Method = Annotated[str, typer.Option("--method", metavar="NAME", help="lumidock, or paper.")]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="YAML file of settings that differ from the defaults.")
+]
 Bits = Annotated[
     int,
     typer.Option(
@@ -110,6 +119,34 @@ def prepare_sequence(folder: Path, force: bool) -> None:
         else:
             stale.unlink(missing_ok=True)
     truth.write_bytes(b"")  # marks the folder as simulated, also when the simulation is cut short
+
+
+def localizer_of(method: str, station: Station, camera: Camera, config: Config, cold: bool) -> TwoDoors:
+    """The method of that name. Raises: InputError for one that there is not, or a station that it cannot tell apart."""
+    if method == "lumidock":
+        from lumidock.localizer import Localizer
+
+        return Localizer(station, camera, config, cold=cold)
+    if method == "paper":
+        from lumidock.paper import PaperLocalizer
+
+        return PaperLocalizer(station, camera, config.paper, cold=cold)
+    raise InputError(f"--method {method}: no such method; there are lumidock and paper")
+
+
+def open_any(
+    source: str, fps: float | None, *, topic: str | None = None, bits: int = 16, station: str | None = None
+) -> Source:
+    """A recording by its path or a camera by its address; no colour is read for a `station` of white lights alone."""
+    gray = station is not None and set(load_station(shipped_or_path("station", station)).color) == {"white"}
+    return open_live(source, gray=gray) or open_source(Path(source), fps, topic=topic, bits=bits, gray=gray)
+
+
+def calibration_of(given: str | None, source: Source) -> Camera:
+    """The camera by the option, beside the frames, or within the source. Raises: InputError where there is none."""
+    if given is None and source.camera is None and source.calibration is not None:
+        return source.calibration
+    return load_camera(file_of("camera", given, source.camera, source))
 
 
 def simulated(source: str, folder: Path, station: str | None, camera: str | None) -> Path:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import cv2
 import numpy as np
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
@@ -16,32 +15,11 @@ from rosbags.typesys.store import Typestore
 from lumidock.camera import Camera, camera_from
 from lumidock.datatypes import Image
 from lumidock.errors import FrameError, InputError
-from lumidock.streams.images import MAX_PIXELS, decode_image, mono_if_gray
+from lumidock.streams.images import decode_image
+from lumidock.streams.pixels import unpack
 
 IMAGE, COMPRESSED, CAMERA_INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _UNREADABLE = (SerdeError, ValueError, IndexError, KeyError, TypeError, AssertionError, struct.error, MemoryError)
-
-# channels, bytes each, conversion to bgr8 or mono8; sensor_msgs/image_encodings.hpp
-_BAYER = {"rggb": cv2.COLOR_BayerRGGB2BGR, "bggr": cv2.COLOR_BayerBGGR2BGR, "gbrg": cv2.COLOR_BayerGBRG2BGR}
-_BAYER["grbg"] = cv2.COLOR_BayerGRBG2BGR
-_ENCODINGS: dict[str, tuple[int, int, int | None]] = {
-    "mono8": (1, 1, None),
-    "8UC1": (1, 1, None),
-    "mono16": (1, 2, None),
-    "16UC1": (1, 2, None),
-    "bgr8": (3, 1, None),
-    "8UC3": (3, 1, None),
-    "rgb8": (3, 1, cv2.COLOR_RGB2BGR),
-    "bgr16": (3, 2, None),
-    "rgb16": (3, 2, cv2.COLOR_RGB2BGR),
-    "bgra8": (4, 1, cv2.COLOR_BGRA2BGR),
-    "rgba8": (4, 1, cv2.COLOR_RGBA2BGR),
-    "uyvy": (2, 1, cv2.COLOR_YUV2BGR_UYVY),
-    "yuv422": (2, 1, cv2.COLOR_YUV2BGR_UYVY),
-    "yuyv": (2, 1, cv2.COLOR_YUV2BGR_YUY2),
-    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2BGR_YUY2),
-    **{f"bayer_{pattern}{8 * size}": (1, size, code) for pattern, code in _BAYER.items() for size in (1, 2)},
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +69,12 @@ def picture_of(message: Message, *, bits: int = 16) -> tuple[int, Image]:
     t_ns = _stamp_ns(content.header.stamp) or message.log_ns
     try:
         if message.type == COMPRESSED:
-            return t_ns, decode_image(bytes(content.data), message.topic)
-        return t_ns, _raw_picture(content, message.topic, bits)
-    except (cv2.error, MemoryError, ValueError) as error:
-        raise FrameError("bad_frame", f"{message.topic}: {' '.join(str(error).split())}") from None
+            return t_ns, decode_image(bytes(content.data), "compressed")
+        size, order = (int(content.width), int(content.height)), ">" if content.is_bigendian else "<"
+        encoding, data = str(content.encoding), np.asarray(content.data, np.uint8)
+        return t_ns, unpack(data, encoding, size, int(content.step), order=order, bits=bits)
+    except FrameError as error:
+        raise FrameError(error.reason, f"{message.topic}: {error}") from None
 
 
 def stamp_of(message: Message) -> int:
@@ -131,23 +111,3 @@ def _deserialize(message: Message) -> Any:  # noqa: ANN401  # classes made at ru
 
 def _stamp_ns(stamp: Any) -> int:  # noqa: ANN401
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
-
-
-def _raw_picture(content: Any, topic: str, bits: int) -> Image:  # noqa: ANN401
-    width, height, step = int(content.width), int(content.height), int(content.step)
-    encoding = _ENCODINGS.get(str(content.encoding))
-    if encoding is None:
-        raise FrameError("bad_frame", f"{topic}: encoding {str(content.encoding)[:40]!r} is not supported")
-    channels, size, conversion = encoding
-    row = width * channels * size
-    if not 0 < width * height <= MAX_PIXELS or step < row or step * height > len(content.data):
-        raise FrameError("bad_frame", f"{topic}: {width}x{height} pixels do not fit {len(content.data)} bytes")
-    data = np.asarray(content.data, np.uint8)[: step * height].reshape(height, step)[:, :row]
-    pixels = np.ascontiguousarray(data)
-    if size == 2:
-        wide = pixels.view(np.dtype(np.uint16).newbyteorder(">" if content.is_bigendian else "<"))
-        pixels = np.minimum(wide.astype(np.uint16) >> (bits - 8), 255).astype(np.uint8)
-    image = pixels.reshape((height, width) if channels == 1 else (height, width, channels))
-    if conversion is not None:
-        image = np.asarray(cv2.cvtColor(image, conversion), np.uint8)
-    return mono_if_gray(image)

@@ -35,7 +35,7 @@ class Source:
     """An opened source: `items()` iterates over its frames from the start; `count` is how many, if known.
 
     `camera` and `station` are files found beside the frames, `calibration` the camera that a bag describes, `inputs`
-    the files whose hashes identify the source.
+    the files whose hashes identify the source. A `live` one has no end of its own, and is opened again when it is lost.
     """
 
     path: Path
@@ -46,6 +46,7 @@ class Source:
     station: Path | None = None
     inputs: tuple[Path, ...] = ()
     calibration: Camera | None = None
+    live: bool = False
 
 
 def open_source(

@@ -1,0 +1,206 @@
+"""`lumidock serve`."""
+
+from __future__ import annotations
+
+import signal
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lumidock.camera import save_camera
+from lumidock.cli.shared import (
+    SIM,
+    Bits,
+    CameraOption,
+    ConfigOption,
+    Force,
+    Fps,
+    Method,
+    StationOption,
+    Topic,
+    VehicleOption,
+    app,
+    calibration_of,
+    copy,
+    example,
+    file_of,
+    localizer_of,
+    open_any,
+    prepare_folder,
+    simulated,
+)
+from lumidock.config import Config, load_config
+from lumidock.errors import InputError, extra
+from lumidock.serve import STALE_S, Camera, Newest, Server, Worker, warm_up
+from lumidock.sinks import FILE_KINDS, Numbered, RunSink, Scene, Sink, open_rerun
+from lumidock.station import load_station
+from lumidock.vehicle import load_vehicle
+
+_LOOPBACK = "127.0.0.1"
+_SHORT, _LONG = 2, 64  # frames that wait for a network, and for a disk
+
+
+@app.command(
+    "serve",
+    epilog=example(
+        "lumidock serve rtsp://192.168.2.10/front --station dock.yaml --camera camera.yaml "
+        "--vehicle vehicle.yaml --mavlink 127.0.0.1:14550",
+        "lumidock serve gige: --station dock.yaml --camera camera.yaml --zenoh tcp/127.0.0.1:7447 --out RUN",
+        "lumidock serve sim:approach --foxglove",
+    ),
+)
+def _serve(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SOURCE",
+            help="rtsp://..., rtp://HOST:PORT, /dev/videoN, gige:[NAME], sim:SCENARIO, or a recording at its own pace.",
+        ),
+    ],
+    station: StationOption = None,
+    camera: CameraOption = None,
+    vehicle: VehicleOption = None,
+    method: Method = "lumidock",
+    topic: Topic = None,
+    bits: Bits = 16,
+    fps: Fps = None,
+    config: ConfigOption = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Show a recording again and again.")] = False,
+    mavlink: Annotated[
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="Send VISION_POSITION_ESTIMATE there by UDP; needs --vehicle."),
+    ] = None,
+    zenoh: Annotated[
+        str | None, typer.Option(metavar="ENDPOINT", help="Publish to ROS 2 by this zenoh router: tcp/127.0.0.1:7447.")
+    ] = None,
+    dds: Annotated[bool, typer.Option("--dds", help="Publish to ROS 2 by DDS.")] = False,
+    domain: Annotated[int, typer.Option(metavar="N", min=0, max=232, help="ROS_DOMAIN_ID.")] = 0,
+    foxglove: Annotated[bool, typer.Option("--foxglove", help="Let Foxglove connect, at --foxglove-port.")] = False,
+    foxglove_port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535)] = 8765,
+    rerun: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Show in the viewer at rerun+http://HOST:PORT/proxy.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write a run folder.")] = None,
+    record: Annotated[
+        list[Path] | None, typer.Option(metavar="FILE", help="Write a .mcap, .rrd or .mp4 file; may be repeated.")
+    ] = None,
+    health_port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="Of the health page.")] = 8780,
+    host: Annotated[
+        str,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Where the health page and Foxglove listen; DDS leaves this machine when it is another.",
+        ),
+    ] = _LOOPBACK,
+    force: Force = False,
+) -> None:
+    """Localize live and tell the vehicle, until stopped."""
+    from lumidock.streams.healthpage import HealthPage
+
+    with ExitStack() as stack:
+        if source.startswith(SIM):
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            source = str(simulated(source, folder / "sequence", station, camera))
+        opened = open_any(source, fps, topic=topic, bits=bits, station=station)
+        station_file = file_of("station", station, opened.station, opened)
+        dock = load_station(station_file)
+        lens = calibration_of(camera, opened)
+        scene = Scene(dock, lens, load_vehicle(vehicle) if vehicle else None)
+        settings = load_config(config) if config else Config()
+        warm_up(localizer_of(method, dock, lens, settings, cold=False), dock, lens)
+        localizer = localizer_of(method, dock, lens, settings, cold=False)
+        sinks = [
+            *_vehicle_sinks(scene, mavlink, zenoh, domain if dds else None, domain, host),
+            *_viewer_sinks(scene, foxglove_port if foxglove else None, rerun, host),
+            *_file_sinks(scene, station_file, out, record or [], force),
+        ]
+        stop, newest = threading.Event(), Newest()
+        reader = Camera(opened.items, newest, live=opened.live, loop=loop, stop=stop)
+        server = Server(localizer, reader, newest, sinks, stop)
+        page = HealthPage(host, health_port, server.health)
+        stack.callback(page.close)
+        print(f"health at http://{host}:{page.port}/", flush=True)
+        with _stopped_by_signals(stop):
+            server.serve()
+    counts = server.counts
+    print(f"{counts['frames']} frames: {counts['valid']} valid; {newest.dropped} came too fast and were dropped")
+    if reader.problem:
+        raise InputError(reader.problem)
+
+
+@contextmanager
+def _stopped_by_signals(stop: threading.Event) -> Iterator[None]:
+    """Let SIGTERM and Ctrl-C end the serving in good order."""
+    numbers = (signal.SIGTERM, signal.SIGINT)
+    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+def _vehicle_sinks(
+    scene: Scene, mavlink: str | None, zenoh: str | None, dds: int | None, domain: int, host: str
+) -> list[Worker]:
+    workers, shared = [], (scene.camera, scene.vehicle, scene.station.ids)
+    if mavlink is not None:
+        if scene.vehicle is None:
+            raise InputError("--mavlink needs --vehicle FILE: an autopilot wants the pose of the vehicle's body")
+        with extra("mavlink"):
+            from lumidock.streams.mavlink import Mavlink
+        name, port = _host_and_port("--mavlink", mavlink)
+        workers.append(Worker("mavlink", partial(Mavlink, name, port, scene.vehicle), queue=1, stale_s=STALE_S))
+    if zenoh is not None:
+        with extra("zenoh"), extra("bag"):
+            from lumidock.streams.zenohlink import ZenohLink
+        workers.append(Worker("zenoh", partial(ZenohLink, zenoh, domain, *shared), queue=_SHORT))
+    if dds is not None:
+        with extra("dds"), extra("bag"):
+            from lumidock.streams.ddslink import DdsLink
+        workers.append(Worker("dds", partial(DdsLink, dds, host != _LOOPBACK, *shared), queue=_SHORT))
+    return workers
+
+
+def _viewer_sinks(scene: Scene, foxglove_port: int | None, rerun: str | None, host: str) -> list[Worker]:
+    workers = []
+    if foxglove_port is not None:
+        with extra("live"), extra("bag"):
+            from lumidock.streams.foxglovelive import FoxgloveLive
+        shared = (scene.camera, scene.vehicle, scene.station.ids)
+        workers.append(Worker("foxglove", partial(FoxgloveLive, host, foxglove_port, *shared), queue=_SHORT))
+    if rerun is not None:
+        if not rerun.startswith("rerun+http"):
+            raise InputError(f"--rerun {rerun}: wanted rerun+http://HOST:PORT/proxy")
+        workers.append(Worker("rerun", partial(open_rerun, rerun, scene), queue=_SHORT))
+    return workers
+
+
+def _file_sinks(scene: Scene, station_file: Path, out: Path | None, record: list[Path], force: bool) -> list[Worker]:
+    openers: dict[str, Callable[[], Sink]] = {}
+    if out is not None:
+        prepare_folder(out, force)
+        folder = RunSink(out, scene.station.ids)
+        copy(station_file, out / "station.yaml")
+        save_camera(scene.camera, out / "camera.yaml")
+        openers[out.name] = lambda: folder
+    for path in record:
+        if path.suffix not in FILE_KINDS:
+            raise InputError(f"--record {path}: not one of {', '.join(FILE_KINDS)}")
+        if path.exists() and not force:
+            raise InputError(f"{path}: exists; give --force to replace it")
+        openers[path.name] = Numbered(path, scene).open
+    return [Worker(name, opener, queue=_LONG) for name, opener in openers.items()]
+
+
+def _host_and_port(option: str, text: str) -> tuple[str, int]:
+    host, colon, port = text.rpartition(":")
+    if not (colon and host and port.isdecimal() and 0 < int(port) < 65536):
+        raise InputError(f"{option} {text}: wanted HOST:PORT")
+    return host, int(port)

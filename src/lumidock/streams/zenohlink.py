@@ -1,0 +1,82 @@
+"""Fixes to ROS 2 over zenoh, in the way of rmw_zenoh, without ROS. Source: docs/design.md of ros2/rmw_zenoh."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import zenoh
+from zenoh.ext import Int64, z_serialize
+
+from lumidock.camera import Camera
+from lumidock.datatypes import Detections, Fix, Frame, Unusable
+from lumidock.streams import ros2
+from lumidock.vehicle import Vehicle
+
+_NODE = "lumidock"
+_QOS = "::,10:,:,:,,"  # the defaults of ROS 2: reliable, volatile, the last ten
+_RETRY_MS = 1000
+
+
+class ZenohLink:
+    """Publishes to the zenoh router or peer at `endpoint`; where there is none, messages are dropped, not kept."""
+
+    def __init__(
+        self, endpoint: str, domain: int, camera: Camera, vehicle: Vehicle | None, light_ids: tuple[str, ...]
+    ) -> None:
+        """Connect to `endpoint`, tcp/HOST:PORT, and to nothing else; it need not be there yet.
+
+        Raises: OSError for an endpoint that is none.
+        """
+        config = zenoh.Config()
+        for key, value in {
+            "mode": "peer",
+            "connect/endpoints": [endpoint],
+            "connect/timeout_ms": 0,
+            "connect/exit_on_failure": False,
+            "connect/retry": {"period_init_ms": _RETRY_MS, "period_max_ms": _RETRY_MS},
+            "listen/endpoints": [],
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+        }.items():
+            config.insert_json5(key, json.dumps(value))
+        try:
+            self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise OSError(f"{endpoint}: {error}") from None
+        self._camera, self._vehicle, self._light_ids = camera, vehicle, light_ids
+        self._id = str(self._session.zid())
+        self._gid = bytes.fromhex(self._id.rjust(32, "0"))
+        self._publishers, self._sequence = dict[str, zenoh.Publisher](), 0
+        liveliness = self._session.liveliness()
+        self._tokens = [liveliness.declare_token(f"@ros2_lv/{domain}/{self._id}/0/0/NN/%/%/{_NODE}")]
+        for number, (topic, kind) in enumerate(ros2.TYPES.items(), start=1):
+            name, place = dds_name(kind), topic.replace("/", "%")
+            typed = f"{name}/{ros2.type_hash(kind)}"
+            self._publishers[topic] = self._session.declare_publisher(
+                f"{domain}/{topic.lstrip('/')}/{typed}", congestion_control=zenoh.CongestionControl.DROP
+            )
+            token = f"@ros2_lv/{domain}/{self._id}/0/{number}/MP/%/%/{_NODE}/{place}/{typed}/{_QOS}"
+            self._tokens.append(liveliness.declare_token(token))
+
+    def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
+        """Publish one frame."""
+        if self._vehicle is not None and item.t_ns is not None:
+            self._put(ros2.mounting(self._vehicle, item.t_ns))
+        for message in ros2.messages(item, fix, latency_us, self._camera, self._vehicle, self._light_ids):
+            self._put(message)
+
+    def _put(self, message: ros2.Serialized) -> None:
+        self._sequence += 1
+        attachment = z_serialize((Int64(self._sequence), Int64(time.time_ns()), self._gid))
+        self._publishers[message.topic].put(message.data, attachment=attachment)
+
+    def close(self) -> None:
+        """Part from the network."""
+        self._session.close()
+
+
+def dds_name(message_type: str) -> str:
+    """The name of a type in DDS: geometry_msgs::msg::dds_::Pose_."""
+    package, _, name = message_type.split("/")
+    return f"{package}::msg::dds_::{name}_"
