@@ -49,17 +49,29 @@ def read_mapping(path: Path) -> dict[str, Any]:
     Raises: InputError, one line, when it cannot be read or parsed, is over 1 MiB, nested too deep or uses aliases
     or tags.
     """
+    return parse_mapping(read_text(path), path)
+
+
+def read_text(path: Path) -> str:
+    """The text of a small file. Raises: InputError, one line, when it cannot be read or is over 1 MiB."""
     try:
         with path.open("rb") as file:
             content_bytes = file.read(MAX_BYTES + 1)  # not the size on disk: a device or a pipe has none
         if len(content_bytes) > MAX_BYTES:
             raise InputError(f"{path}: larger than {MAX_BYTES} bytes")
-        text = content_bytes.decode("utf-8")
-        _check_structure(text)
-        content = yaml.load(text, Loader=_StrictLoader)
+        return content_bytes.decode("utf-8")
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError) as error:
+    except ValueError as error:  # no UTF-8, or a name that no file can have
+        raise InputError(f"{path}: not valid YAML: {error}") from None
+
+
+def parse_mapping(text: str, path: Path) -> dict[str, Any]:
+    """The mapping that a text in YAML stands for; `path` is what an error calls it. Raises: as `read_mapping`."""
+    try:
+        _check_structure(text)
+        content = yaml.load(text, Loader=_StrictLoader)
+    except (yaml.YAMLError, ValueError, TypeError) as error:
         raise InputError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: wanted keys and values at the top level")

@@ -15,7 +15,7 @@ import cv2
 import typer
 
 from lumidock.camera import load_camera, save_camera
-from lumidock.cli import exporting, inspection, serving
+from lumidock.cli import calibration, exporting, inspection, serving
 from lumidock.cli.evaluation import print_evaluation
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
@@ -56,7 +56,7 @@ from lumidock.streams.sources import Item, open_source
 _MAX_SEED = 10**9
 
 
-_COMMANDS = (inspection, exporting, serving)  # importing them adds their commands
+_COMMANDS = (inspection, exporting, serving, calibration)  # importing them adds their commands
 
 
 def main() -> None:

@@ -1,0 +1,118 @@
+"""`lumidock calib`."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lumidock.camera import Camera, load_camera
+from lumidock.cli.shared import AsJson, Force, app, example, open_any, shipped_or_path
+from lumidock.datatypes import Frame
+from lumidock.errors import InputError
+
+calib = typer.Typer(help="Read, write and check camera calibrations.", no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(calib, name="calib")
+
+Size = Annotated[str | None, typer.Option("--size", metavar="WxH", help="Image size that it has to be for.")]
+
+
+@calib.command("import", epilog=example("lumidock calib import camchain.yaml camera.yaml --name cam1"))
+def _import(
+    source: Annotated[Path, typer.Argument(metavar="FILE", help="ROS camera_info, Kalibr camchain or OpenCV file.")],
+    target: Annotated[Path, typer.Argument(metavar="CAMERA", help="camera_info file to write.")],
+    name: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera of a camchain.")] = None,
+    size: Size = None,
+    force: Force = False,
+) -> None:
+    """Turn FILE into a camera_info file."""
+    from lumidock.calib import read_calibration, write_calibration
+
+    camera = read_calibration(source, name=name, size=_size(size))
+    _write_new(target, force)
+    write_calibration(camera, target, "ros")
+    print(f"{camera.width} x {camera.height}, {camera.model}, written to {target}")
+
+
+@calib.command("export", epilog=example("lumidock calib export camera.yaml camchain.yaml --to kalibr"))
+def _export(
+    source: Annotated[str, typer.Argument(metavar="CAMERA", help="camera_info file, or the name of a shipped one.")],
+    target: Annotated[Path, typer.Argument(metavar="FILE", help="File to write.")],
+    form: Annotated[str, typer.Option("--to", metavar="FORM", help="ros, kalibr or opencv.")],
+    force: Force = False,
+) -> None:
+    """Turn a camera_info file into another tool's."""
+    from lumidock.calib import write_calibration
+
+    camera = load_camera(shipped_or_path("camera", source))
+    _write_new(target, force)
+    write_calibration(camera, target, form)
+    print(f"written to {target}")
+
+
+@calib.command(
+    "check",
+    epilog=example(
+        "lumidock calib check camera.yaml --source dive.mcap",
+        "lumidock calib check camera.yaml --lens-mm 6 --pixel-um 3.45",
+    ),
+)
+def _check(
+    source: Annotated[str, typer.Argument(metavar="CAMERA", help="Calibration of any kind, or a shipped name.")],
+    name: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera of a camchain.")] = None,
+    size: Size = None,
+    frames: Annotated[
+        str | None, typer.Option("--source", metavar="SOURCE", help="Frames whose size it has to be for.")
+    ] = None,
+    lens_mm: Annotated[float | None, typer.Option(metavar="F", min=0.1, help="The lens's focal length.")] = None,
+    pixel_um: Annotated[float | None, typer.Option(metavar="P", min=0.1, help="The sensor's pixel pitch.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the field of view, and warn of what looks wrong."""
+    from lumidock.calib import check, read_calibration
+
+    if (lens_mm is None) != (pixel_um is None):
+        raise InputError("--lens-mm and --pixel-um belong together")
+    camera = read_calibration(shipped_or_path("camera", source), name=name, size=_size(size))
+    if frames is not None:
+        _require_size_of(frames, camera, source)
+    verdict = check(camera, lens_mm=lens_mm, pixel_um=pixel_um)
+    if as_json:
+        print(json.dumps({"width": camera.width, "height": camera.height, "model": camera.model} | asdict(verdict)))
+        return
+    across, down, diagonal = verdict.field_of_view_deg
+    print(f"size        {camera.width} x {camera.height}, {camera.model}")
+    print(f"focal       {camera.focal_px[0]:.1f}, {camera.focal_px[1]:.1f} px")
+    print(f"field       {across:.1f} x {down:.1f} degrees, {diagonal:.1f} across the corners")
+    for warning in verdict.warnings:
+        print(f"WARNING     {warning}")
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    found = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text)
+    if found is None:
+        raise InputError(f"--size {text}: wanted WIDTHxHEIGHT")
+    return int(found[1]), int(found[2])
+
+
+def _require_size_of(frames: str, camera: Camera, source: str) -> None:
+    """Raises: InputError when the first frame that can be read is of another size."""
+    for item in open_any(frames, None if not Path(frames).is_dir() else 1.0).items():
+        if isinstance(item, Frame):
+            height, width = item.image.shape[:2]
+            if (width, height) != (camera.width, camera.height):
+                text = f"made for {camera.width}x{camera.height} pixels, the frames of {frames} have {width}x{height}"
+                raise InputError(f"{source}: {text}")
+            return
+    raise InputError(f"{frames}: no frame that can be read")
+
+
+def _write_new(path: Path, force: bool) -> None:
+    if path.exists() and not force:
+        raise InputError(f"{path}: exists; give --force to replace it")
