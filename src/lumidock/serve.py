@@ -6,11 +6,12 @@ fix to the sinks, each of which has a thread and a short queue of its own, so th
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ _RECENT = 1000  # frames that rates and latencies are taken over
 _RETRY_S = 1.0  # until a lost camera or a failed sink is tried again
 _CLOSING_S = 5.0  # a sink may take to write what is left
 _DRAWN_AT_M = 6.0
+_NICE = 10  # of threads that encode pictures, on Linux a matter of each thread
 _LOOP_PAUSE_NS = 3_000_000_000  # between two passes over a recording: no track is carried across
 STALE_S = 0.25  # ArduPilot takes an estimate for lost after 0.3
 
@@ -127,12 +129,29 @@ class Done:
     latency_us: int | None
 
 
+def _without_picture(done: Done) -> Done:
+    item = done.taken.item
+    if not isinstance(item, Frame):
+        return done
+    return replace(done, taken=Taken(Unusable(item.name, item.t_ns, "", ""), done.taken.at_s))
+
+
 class Worker(threading.Thread):
     """Feeds one sink from a queue that drops its oldest; a sink that fails is opened again."""
 
-    def __init__(self, name: str, open_sink: Callable[[], Sink], *, queue: int, stale_s: float | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        open_sink: Callable[[], Sink],
+        *,
+        queue: int,
+        stale_s: float | None = None,
+        pictures: bool = True,
+    ) -> None:
+        """Feed the sink that `open_sink` opens; without `pictures` it is given the frames' names and stamps alone."""
         super().__init__(name=name, daemon=True)
         self._open, self._queue, self._stale_s = open_sink, deque[Done](maxlen=queue), stale_s
+        self._pictures = pictures
         self._changed, self._halt = threading.Condition(), False
         self.sent, self.dropped, self.stale, self.errors, self.problem = 0, 0, 0, 0, ""
         self.delay_s = deque[float](maxlen=_RECENT)  # from the frame's arrival to the end of sending
@@ -141,7 +160,7 @@ class Worker(threading.Thread):
         """Queue a fix, in place of the oldest where the queue is full; never waits."""
         with self._changed:
             self.dropped += len(self._queue) == self._queue.maxlen
-            self._queue.append(done)
+            self._queue.append(done if self._pictures else _without_picture(done))
             self._changed.notify()
 
     def finish(self) -> None:
@@ -153,6 +172,8 @@ class Worker(threading.Thread):
 
     def run(self) -> None:
         """Open, feed and close the sink, again and again if need be."""
+        if self._pictures:  # encoding them may wait; the next fix may not
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         while not self._over():
             try:
                 sink = self._open()

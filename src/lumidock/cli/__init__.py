@@ -15,7 +15,7 @@ import cv2
 import typer
 
 from lumidock.camera import load_camera, save_camera
-from lumidock.cli import calibration, exporting, inspection, serving
+from lumidock.cli import calibration, exporting, inspection, machine, serving, stations
 from lumidock.cli.evaluation import print_evaluation
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
@@ -56,7 +56,7 @@ from lumidock.streams.sources import Item, open_source
 _MAX_SEED = 10**9
 
 
-_COMMANDS = (inspection, exporting, serving, calibration)  # importing them adds their commands
+_COMMANDS = (inspection, exporting, serving, calibration, stations, machine)  # importing them adds their commands
 
 
 def main() -> None:
@@ -190,7 +190,13 @@ def _run(
         print("not valid: " + ", ".join(f"{word} {count}" for word, count in sorted(counts["reason"].items())))
 
 
-@app.command("sim")
+@app.command(
+    "sim",
+    epilog=example(
+        "lumidock sim approach --seed 3 --out SEQ",
+        "lumidock sim trials --detections --set faults.missing=2 --out SEQ",
+    ),
+)
 def _sim(
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help=f"{SCENARIOS}, or a .yaml file.")],
     out: Out,
@@ -221,7 +227,7 @@ def _sim(
     print(f"{frames} frames written to {out}")
 
 
-@app.command("eval")
+@app.command("eval", epilog=example("lumidock eval RUN SEQ"))
 def _eval(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
     truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="Simulated sequence folder, or a truth.csv.")],
@@ -237,7 +243,7 @@ def _eval(
         print_evaluation(result)
 
 
-@app.command("campaign")
+@app.command("campaign", epilog=example("lumidock campaign nominal --seeds 0:100 --out CAMPAIGN"))
 def _campaign(
     scenarios: Annotated[list[str], typer.Argument(metavar="SCENARIO", help=f"{SCENARIOS}, or .yaml files.")],
     out: Annotated[
@@ -302,7 +308,7 @@ def _seeds(text: str) -> tuple[int, int]:
     return int(first), int(stop)
 
 
-@app.command("demo")
+@app.command("demo", epilog=example("lumidock demo --force"))
 def _demo(
     out: Out = Path("demo-out"),
     seed: Seed = 0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -38,12 +38,12 @@ from lumidock.cli.shared import (
 from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
 from lumidock.serve import STALE_S, Camera, Newest, Server, Worker, warm_up
-from lumidock.sinks import FILE_KINDS, Numbered, RunSink, Scene, Sink, open_rerun
+from lumidock.sinks import FILE_KINDS, Numbered, RunSink, Scene, open_rerun
 from lumidock.station import load_station
 from lumidock.vehicle import load_vehicle
 
 _LOOPBACK = "127.0.0.1"
-_SHORT, _LONG = 2, 64  # frames that wait for a network, and for a disk
+_SHORT, _LONG, _ROWS = 2, 8, 256  # that wait for a network, and with and without pictures for a disk
 
 
 @app.command(
@@ -156,7 +156,9 @@ def _vehicle_sinks(
         with extra("mavlink"):
             from lumidock.streams.mavlink import Mavlink
         name, port = _host_and_port("--mavlink", mavlink)
-        workers.append(Worker("mavlink", partial(Mavlink, name, port, scene.vehicle), queue=1, stale_s=STALE_S))
+        workers.append(
+            Worker("mavlink", partial(Mavlink, name, port, scene.vehicle), queue=1, stale_s=STALE_S, pictures=False)
+        )
     if zenoh is not None:
         with extra("zenoh"), extra("bag"):
             from lumidock.streams.zenohlink import ZenohLink
@@ -183,20 +185,20 @@ def _viewer_sinks(scene: Scene, foxglove_port: int | None, rerun: str | None, ho
 
 
 def _file_sinks(scene: Scene, station_file: Path, out: Path | None, record: list[Path], force: bool) -> list[Worker]:
-    openers: dict[str, Callable[[], Sink]] = {}
+    workers = []
     if out is not None:
         prepare_folder(out, force)
         folder = RunSink(out, scene.station.ids)
         copy(station_file, out / "station.yaml")
         save_camera(scene.camera, out / "camera.yaml")
-        openers[out.name] = lambda: folder
+        workers.append(Worker(out.name, lambda: folder, queue=_ROWS, pictures=False))
     for path in record:
         if path.suffix not in FILE_KINDS:
             raise InputError(f"--record {path}: not one of {', '.join(FILE_KINDS)}")
         if path.exists() and not force:
             raise InputError(f"{path}: exists; give --force to replace it")
-        openers[path.name] = Numbered(path, scene).open
-    return [Worker(name, opener, queue=_LONG) for name, opener in openers.items()]
+        workers.append(Worker(path.name, Numbered(path, scene).open, queue=_LONG))
+    return workers
 
 
 def _host_and_port(option: str, text: str) -> tuple[str, int]:

@@ -32,7 +32,7 @@ from lumidock.streams.sources import Source, open_source
 if TYPE_CHECKING:
     from lumidock.run import TwoDoors
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
 SIM = "sim:"
 DEFAULT_STATION, DEFAULT_CAMERA = "cage-2x2x5", "imx264-60deg"

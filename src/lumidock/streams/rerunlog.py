@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import rerun as rr
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
 from lumidock.station import Station
+from lumidock.streams.jpeg import jpeg_of
 
 _LAYER_COLORS = ((255, 220, 80), (60, 190, 255), (120, 255, 120))
 _SPURIOUS = (255, 60, 60)
-_JPEG_QUALITY = 85
 _FIRST_EPOCH_NS = 10**18  # stamps from 2001 on are dates, smaller ones count from the start of something
 
 
@@ -47,8 +46,8 @@ class RerunLog:
         else:
             self._stream.set_time("elapsed", duration=np.timedelta64(item.t_ns, "ns"))
         if isinstance(item, Frame):
-            data = cv2.imencode(".jpg", item.image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
-            self._stream.log("dock/camera/image", rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg"))
+            picture = rr.EncodedImage(contents=jpeg_of(item.image), media_type="image/jpeg")
+            self._stream.log("dock/camera/image", picture)
         self._log_detections(fix)
         self._log_pose(fix)
         self._log_numbers(fix, latency_us)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import cv2
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -19,6 +18,7 @@ from rosbags.typesys.store import Typestore
 from lumidock.camera import Camera
 from lumidock.datatypes import Array, Detections, Fix, Frame, Image, Unusable
 from lumidock.geometry import quat_xyzw_from_rotation, se3_inverse
+from lumidock.streams.jpeg import jpeg_of
 from lumidock.vehicle import Vehicle
 
 STATUS_MSG = """\
@@ -75,7 +75,6 @@ TYPES = {
     f"{PREFIX}/image/compressed": "sensor_msgs/msg/CompressedImage",
     f"{PREFIX}/annotations": "foxglove_msgs/msg/ImageAnnotations",
 }
-_JPEG_QUALITY = 85
 _NAMED, _SPURIOUS = (0.3, 1.0, 0.4, 1.0), (1.0, 0.25, 0.25, 1.0)
 
 
@@ -219,8 +218,8 @@ def _camera_info(camera: Camera, t_ns: int, frames: _Frames) -> Any:  # noqa: AN
 
 
 def _compressed(image: Image, t_ns: int, frames: _Frames) -> Any:  # noqa: ANN401
-    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
-    return _make("sensor_msgs/msg/CompressedImage", _header(t_ns, frames.camera), "jpeg", data.reshape(-1))
+    data = np.frombuffer(jpeg_of(image), np.uint8)
+    return _make("sensor_msgs/msg/CompressedImage", _header(t_ns, frames.camera), "jpeg", data)
 
 
 def _annotations(fix: Fix, t_ns: int, light_ids: tuple[str, ...]) -> Any:  # noqa: ANN401
