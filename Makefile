@@ -4,7 +4,7 @@ UV     ?= $(shell command -v uv)
 BIN    := .venv/bin
 READY  := .venv/.ready
 
-.PHONY: setup demo test slow bench lint lock clean
+.PHONY: setup demo test slow peers bench lint lock clean
 setup: $(READY)
 
 $(READY): requirements.lock pyproject.toml
@@ -23,6 +23,13 @@ test: lint
 
 slow: setup
 	@$(BIN)/python -m pytest -m slow
+
+# clients that others wrote; those of Debian are in tests/peers/README
+peers: setup
+	@npm install --silent --no-audit --no-fund --no-package-lock --prefix .peers @mcap/core @mcap/nodejs @mcap/support \
+	  @foxglove/rosmsg @foxglove/rosmsg2-serialization @foxglove/ws-protocol ws node-mavlink || true
+	@test -x .peers/evo/bin/evo_ape || { $(PYTHON) -m venv .peers/evo && .peers/evo/bin/python -m pip install -qq evo; } || true
+	@$(BIN)/python -m pytest -m peers -rs
 
 lint: setup
 	@$(BIN)/ruff format --check .

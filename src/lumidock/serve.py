@@ -82,7 +82,7 @@ class Camera(threading.Thread):
         while not self._halt.is_set():
             try:
                 self._pass()
-                self.problem = "the stream ended" if self._live else ""
+                self.problem = "the stream ended" if self._live and not self._halt.is_set() else ""
             except (LumidockError, OSError) as error:
                 self.problem = str(error)
             if not self._live and (not self._loop or self.problem):

@@ -130,7 +130,7 @@ def _serve(
             server.serve()
     counts = server.counts
     print(f"{counts['frames']} frames: {counts['valid']} valid; {newest.dropped} came too fast and were dropped")
-    if reader.problem:
+    if reader.problem and not opened.live:
         raise InputError(reader.problem)
 
 

@@ -38,7 +38,7 @@ def frames_of(name: str) -> Iterator[Item]:
         encoding = _ENCODINGS.get(camera.get_pixel_format_as_string())
         if encoding is None:
             raise InputError(f"gige:{name}: pixel format {camera.get_pixel_format_as_string()} is not supported")
-        stream = camera.create_stream(None, None)
+        stream = _stream_of(aravis, camera)
         for _ in range(_BUFFERS):
             stream.push_buffer(aravis.Buffer.new_allocate(camera.get_payload()))
         camera.start_acquisition()
@@ -48,6 +48,17 @@ def frames_of(name: str) -> Iterator[Item]:
             camera.stop_acquisition()
     except errors as error:
         raise InputError(f"gige:{name}: {' '.join(str(getattr(error, 'message', error)).split())}") from None
+
+
+def _stream_of(aravis: Any, camera: Any) -> Any:  # noqa: ANN401
+    """A stream whose socket holds some frames: each comes as a burst, and a packet that is dropped spoils it."""
+    if not camera.is_gv_device():
+        return camera.create_stream(None, None)
+    camera.gv_set_stream_options(aravis.GvStreamOption.PACKET_SOCKET_DISABLED)  # raw sockets want privileges
+    stream = camera.create_stream(None, None)
+    stream.set_property("socket-buffer", aravis.GvStreamSocketBuffer.FIXED)
+    stream.set_property("socket-buffer-size", _BUFFERS * camera.get_payload())
+    return stream
 
 
 def _aravis() -> tuple[Any, type[Exception]]:
