@@ -296,7 +296,8 @@ def rtsp():
     yield serve
     for process in running:
         process.kill()
-        process.communicate()
+        process.wait()
+        process.stdout.close()
 
 
 def take(source, count):
@@ -338,7 +339,6 @@ def test_serve_comes_back_to_a_camera_that_was_lost(rtsp, made, tmp_path):
         wait_for(lambda: health()["camera"]["frames"] > 10)
         assert health()["ok"]
         first.kill()
-        first.communicate()
         wait_for(lambda: health()["camera"]["problem"], 30)
         seen = health()["camera"]["frames"]
         rtsp(port)

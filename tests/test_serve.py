@@ -446,6 +446,7 @@ def test_a_full_disk_is_told_and_the_vehicle_still_guided(sequence, tmp_path, li
         (("--vehicle", "vehicle.yaml", "--mavlink", "14550"), "wanted HOST:PORT"),
         (("--record", "a.doc"), "not one of"),
         (("--rerun", "127.0.0.1"), "wanted rerun"),
+        (("--zenoh", "127.0.0.1:7447"), "wanted an endpoint"),
     ],
 )
 def test_what_cannot_be_served_is_refused(sequence, words, match):

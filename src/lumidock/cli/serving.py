@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import tempfile
 import threading
@@ -42,7 +43,7 @@ from lumidock.sinks import FILE_KINDS, Numbered, RunSink, Scene, open_rerun
 from lumidock.station import load_station
 from lumidock.vehicle import load_vehicle
 
-_LOOPBACK = "127.0.0.1"
+_LOOPBACK, _ENDPOINT = "127.0.0.1", re.compile(r"(tcp|udp|tls|quic)/[^/?#]+:[0-9]{1,5}")
 _SHORT, _LONG, _ROWS = 2, 8, 256  # that wait for a network, and with and without pictures for a disk
 
 
@@ -160,6 +161,8 @@ def _vehicle_sinks(
             Worker("mavlink", partial(Mavlink, name, port, scene.vehicle), queue=1, stale_s=STALE_S, pictures=False)
         )
     if zenoh is not None:
+        if not _ENDPOINT.fullmatch(zenoh):
+            raise InputError(f"--zenoh {zenoh}: wanted an endpoint, as tcp/127.0.0.1:7447 is one")
         with extra("zenoh"), extra("bag"):
             from lumidock.streams.zenohlink import ZenohLink
         workers.append(Worker("zenoh", partial(ZenohLink, zenoh, domain, *shared), queue=_SHORT))

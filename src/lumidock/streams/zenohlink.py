@@ -28,22 +28,25 @@ class ZenohLink:
 
         Raises: OSError for an endpoint that is none.
         """
-        config = zenoh.Config()
-        for key, value in {
-            "mode": "peer",
-            "connect/endpoints": [endpoint],
-            "connect/timeout_ms": 0,
-            "connect/exit_on_failure": False,
-            "connect/retry": {"period_init_ms": _RETRY_MS, "period_max_ms": _RETRY_MS},
-            "listen/endpoints": [],
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": False,
-        }.items():
-            config.insert_json5(key, json.dumps(value))
+        config, settings = (
+            zenoh.Config(),
+            {
+                "mode": "peer",
+                "connect/endpoints": [endpoint],
+                "connect/timeout_ms": 0,
+                "connect/exit_on_failure": False,
+                "connect/retry": {"period_init_ms": _RETRY_MS, "period_max_ms": _RETRY_MS},
+                "listen/endpoints": [],
+                "scouting/multicast/enabled": False,
+                "scouting/gossip/enabled": False,
+            },
+        )
         try:
+            for key, value in settings.items():
+                config.insert_json5(key, json.dumps(value))
             self._session = zenoh.open(config)
-        except zenoh.ZError as error:
-            raise OSError(f"{endpoint}: {error}") from None
+        except zenoh.ZError:
+            raise OSError(f"{endpoint}: not an endpoint of zenoh, as tcp/127.0.0.1:7447 is one") from None
         self._camera, self._vehicle, self._light_ids = camera, vehicle, light_ids
         self._id = str(self._session.zid())
         self._gid = bytes.fromhex(self._id.rjust(32, "0"))
