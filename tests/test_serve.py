@@ -108,15 +108,24 @@ def listener():
         port.setblocking(False)
         link = common.MAVLink(None)
 
+        sender = []
+
         def read():
             found = []
             while True:
                 try:
-                    found += link.parse_buffer(port.recv(4096)) or []
+                    content, address = port.recvfrom(4096)
                 except BlockingIOError:
                     return found
+                sender[:] = [address]
+                found += link.parse_buffer(content) or []
 
-        yield SimpleNamespace(port=port.getsockname()[1], read=read)
+        def peer():
+            """Address of who sent last."""
+            read()
+            return sender[0]
+
+        yield SimpleNamespace(port=port.getsockname()[1], read=read, peer=peer)
 
 
 def test_only_measured_valid_fixes_are_sent_and_jumps_counted(listener):
@@ -474,3 +483,42 @@ def test_everything_listens_on_this_machine_only(sequence):
     finally:
         served.terminate()
         served.communicate(timeout=20)
+
+
+def test_garbage_and_floods_on_every_port_are_borne(sequence, rng, listener):
+    port = free_port()
+    mavlink = ("--vehicle", sequence / "vehicle.yaml", "--mavlink", f"127.0.0.1:{listener.port}")
+    served = start(sequence, "--loop", "--foxglove", "--foxglove-port", port, *mavlink)
+    page = int(served.url.rstrip("/").rpartition(":")[2])
+
+    def health():
+        return json.loads(urllib.request.urlopen(served.url + "health.json", timeout=30).read())
+
+    def memory_mib():
+        return int(Path(f"/proc/{served.pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+    wait_for(lambda: health()["sinks"]["mavlink"]["sent"] >= 1)
+    before, clients = memory_mib(), []
+    answers = listener.peer()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as flood:
+        for _ in range(3000):
+            flood.sendto(rng.bytes(1000), answers)
+    for number in range(60):
+        with suppress(OSError):
+            client = socket.create_connection(("127.0.0.1", port if number % 2 else page), timeout=2)
+            clients.append(client)
+            client.sendall(rng.bytes(20_000) if number % 3 else b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n")
+    for client in clients:
+        client.close()
+    sent = health()["sinks"]["mavlink"]["sent"]
+    wait_for(lambda: health()["sinks"]["mavlink"]["sent"] > sent + 3, 30)
+    assert memory_mib() < before + 100.0
+    served.terminate()
+    out, err = served.communicate(timeout=20)
+    assert (served.returncode, "Traceback" in err) == (0, False), out
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]

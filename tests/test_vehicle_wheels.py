@@ -23,22 +23,10 @@ def test_core_and_vehicle_extras_resolve_for_aarch64(tmp_path):
     lines = [f"{name}=={version}{' ; ' * bool(marker)}{marker}" for name, version, marker in pins]
     (tmp_path / "pins.txt").write_text("\n".join(lines))
     platforms = [word for platform in PLATFORMS for word in ("--platform", platform)]
-    how = [
-        "--dry-run",
-        "--ignore-installed",
-        "--only-binary=:all:",
-        "--implementation",
-        "cp",
-        "--python-version",
-        "3.11",
-    ]
-    done = subprocess.run(
-        [sys.executable, "-m", "pip", "install", *how, *platforms]
-        + ["--target", str(tmp_path), "-c", str(tmp_path / "pins.txt"), *wanted],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    how = ["--dry-run", "--ignore-installed", "--only-binary=:all:", "--target", str(tmp_path), *platforms]
+    python = ["--implementation", "cp", "--python-version", "3.11"]
+    command = [sys.executable, "-m", "pip", "install", *how, *python, "-c", str(tmp_path / "pins.txt"), *wanted]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     for name in ("numpy", "opencv-python-headless", "rosbags", "av", "pymavlink", "eclipse-zenoh", "foxglove-sdk"):
         assert name in done.stdout.replace("_", "-")

@@ -8,9 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from lumidock.cli.shared import AsJson, CameraOption, Fps, Topic, app, calibration_of, example, progress_bar
+from lumidock.cli.shared import AsJson, CameraOption, Fps, Topic, app, calibration_of, example, open_any, progress_bar
 from lumidock.errors import extra
-from lumidock.streams.sources import open_source
+
+_OF_A_CAMERA = 100  # frames, which has no end
 
 
 @app.command(
@@ -18,24 +19,28 @@ from lumidock.streams.sources import open_source
 )
 def _inspect(
     source: Annotated[
-        Path, typer.Argument(metavar="SOURCE", help="Sequence or image folder, video file, or bag of ROS 1 or ROS 2.")
+        str, typer.Argument(metavar="SOURCE", help="Sequence or image folder, video, bag, or a camera's address.")
     ],
     camera: CameraOption = None,
     topic: Topic = None,
     fps: Fps = None,
+    frames: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Look at so many frames; 100 of a camera.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show sizes, rates, gaps and exposure of SOURCE."""
     from lumidock.streams.inspection import inspect
 
-    opened = open_source(source, fps, topic=topic)
+    opened = open_any(source, fps, topic=topic)
+    most = frames or (_OF_A_CAMERA if opened.live else None)
     known = camera is not None or opened.camera is not None or opened.calibration is not None
     with progress_bar("inspect") as progress:
-        result = inspect(opened, calibration_of(camera, opened) if known else None, progress=progress)
+        result = inspect(opened, calibration_of(camera, opened) if known else None, most=most, progress=progress)
     if opened.kind == "bag":
         with extra("bag"):
             from lumidock.streams.bag import topics_of
-        result["topics"] = [{"name": t.name, "type": t.type, "messages": t.count} for t in topics_of(source)]
+        result["topics"] = [{"name": t.name, "type": t.type, "messages": t.count} for t in topics_of(Path(source))]
     if as_json:
         print(json.dumps(result, indent=1))
     else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -36,11 +37,15 @@ class _Seen:
 
 
 def inspect(
-    source: Source, camera: Camera | None, *, progress: Callable[[int, int | None], None] = lambda _done, _total: None
+    source: Source,
+    camera: Camera | None,
+    *,
+    most: int | None = None,
+    progress: Callable[[int, int | None], None] = lambda _done, _total: None,
 ) -> dict[str, Any]:
-    """Read all of a source and say what is in it; `camera` is the calibration that its frames should fit."""
+    """Read a source, `most` frames of it, and say what is in it; `camera` is the calibration that it should fit."""
     seen = _Seen()
-    for item in source.items():
+    for item in islice(source.items(), most):
         seen.frames += 1
         if item.t_ns is not None:
             seen.t_ns.append(item.t_ns)
