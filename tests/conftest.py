@@ -1,5 +1,6 @@
 """What the tests share: seeded draws, strategies for SE(3), numeric derivatives, closeness, refusals."""
 
+import sys
 import zlib
 from contextlib import contextmanager
 from functools import partial
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from lumidock import cli
 from lumidock.errors import InputError
 
 settings.register_profile("lumidock", derandomize=True, deadline=None, database=None, max_examples=200)
@@ -80,3 +82,16 @@ def refused(path, match):
     text = str(caught.value)
     assert len(text.splitlines()) == 1
     assert str(path) in text
+
+
+@pytest.fixture
+def lumidock(monkeypatch, capfd):
+    """Run the command line in this process; returns (exit code, standard output, standard error)."""
+
+    def call(*words):
+        monkeypatch.setattr(sys, "argv", ["lumidock", *map(str, words)])
+        with pytest.raises(SystemExit) as exited:
+            cli.main()
+        return exited.value.code, *capfd.readouterr()
+
+    return call

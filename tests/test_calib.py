@@ -1,5 +1,4 @@
 import json
-import sys
 
 import cv2
 import numpy as np
@@ -10,7 +9,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
-from lumidock import cli
 from lumidock.calib import check, read_calibration, write_calibration
 from lumidock.camera import Camera, save_camera
 from lumidock.errors import InputError, LumidockError
@@ -43,17 +41,6 @@ cam1:
   intrinsics: [800.0, 801.0, 639.5, 511.5]
   resolution: [1280, 1024]
 """
-
-
-@pytest.fixture
-def lumidock(monkeypatch, capfd):
-    def call(*words):
-        monkeypatch.setattr(sys, "argv", ["lumidock", *map(str, words)])
-        with pytest.raises(SystemExit) as exited:
-            cli.main()
-        return exited.value.code, *capfd.readouterr()
-
-    return call
 
 
 def same(a, b):

@@ -30,19 +30,6 @@ SET = [word for setting in SETTINGS for word in ("--set", setting)]
 
 
 @pytest.fixture
-def lumidock(monkeypatch, capfd):
-    """Run the command line in this process; returns (exit code, standard output, standard error)."""
-
-    def call(*words):
-        monkeypatch.setattr(sys, "argv", ["lumidock", *map(str, words)])
-        with pytest.raises(SystemExit) as exited:
-            cli.main()
-        return exited.value.code, *capfd.readouterr()
-
-    return call
-
-
-@pytest.fixture
 def refusal(lumidock):
     """Run the command line where it must refuse; returns its one line."""
 

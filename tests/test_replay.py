@@ -2,7 +2,6 @@
 
 import csv
 import json
-import sys
 from fractions import Fraction
 
 import av
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from test_run import CAMERA, simulate
 
-from lumidock import cli
 from lumidock.streams.sources import open_source
 
 
@@ -19,17 +17,6 @@ from lumidock.streams.sources import open_source
 def sequence(tmp_path_factory):
     """Seven rendered frames, their stamps whole milliseconds."""
     return simulate(tmp_path_factory.mktemp("sequence"))
-
-
-@pytest.fixture
-def lumidock(monkeypatch, capfd):
-    def call(*words):
-        monkeypatch.setattr(sys, "argv", ["lumidock", *map(str, words)])
-        with pytest.raises(SystemExit) as exited:
-            cli.main()
-        return exited.value.code, *capfd.readouterr()
-
-    return call
 
 
 def frames(sequence):

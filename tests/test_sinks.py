@@ -33,17 +33,6 @@ T_body_cam: {translation: [0.8, 0.1, -0.2], quat_xyzw: [-0.5, 0.5, -0.5, 0.5]}
 """
 
 
-@pytest.fixture
-def lumidock(monkeypatch, capfd):
-    def call(*words):
-        monkeypatch.setattr(sys, "argv", ["lumidock", *map(str, words)])
-        with pytest.raises(SystemExit) as exited:
-            cli.main()
-        return exited.value.code, *capfd.readouterr()
-
-    return call
-
-
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory):
     return simulate(tmp_path_factory.mktemp("sequence"))

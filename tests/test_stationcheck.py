@@ -1,5 +1,4 @@
 import json
-import sys
 
 import cv2
 import numpy as np
@@ -7,7 +6,6 @@ import pytest
 import yaml
 from conftest import assert_close
 
-from lumidock import cli
 from lumidock.camera import load_camera
 from lumidock.cli.shared import shipped_or_path
 from lumidock.config import Config
@@ -17,17 +15,6 @@ from lumidock.stationcheck import Limits, inspect_station, visible_lights
 LIMITS = Limits(1.5, 4, 20.0)
 CAGE = shipped_or_path("station", "cage-2x2x5")
 LENS = load_camera(shipped_or_path("camera", "imx264-60deg"))
-
-
-@pytest.fixture
-def lumidock(monkeypatch, capfd):
-    def call(*words):
-        monkeypatch.setattr(sys, "argv", ["lumidock", *map(str, words)])
-        with pytest.raises(SystemExit) as exited:
-            cli.main()
-        return exited.value.code, *capfd.readouterr()
-
-    return call
 
 
 def dock(path, positions, layer="front", **more):

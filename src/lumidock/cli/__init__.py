@@ -31,6 +31,7 @@ from lumidock.cli.shared import (
     Method,
     Out,
     Seed,
+    SourceArgument,
     StationOption,
     Topic,
     app,
@@ -125,13 +126,7 @@ def _lumidock(
     ),
 )
 def _run(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="SOURCE",
-            help="Sequence or image folder, video file, bag of ROS 1 or ROS 2, or sim:SCENARIO[:SEED].",
-        ),
-    ],
+    source: SourceArgument,
     out: Out,
     station: StationOption = None,
     camera: CameraOption = None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -44,7 +45,37 @@ from lumidock.station import load_station
 from lumidock.vehicle import load_vehicle
 
 _LOOPBACK, _ENDPOINT = "127.0.0.1", re.compile(r"(tcp|udp|tls|quic)/[^/?#]+:[0-9]{1,5}")
+_SWITCH_S = 5e-4  # a thread may hold the interpreter; the default lets the vehicle wait ten times longer
 _SHORT, _LONG, _ROWS = 2, 8, 256  # that wait for a network, and with and without pictures for a disk
+
+
+LiveSource = Annotated[
+    str,
+    typer.Argument(
+        metavar="SOURCE",
+        help="rtsp://..., rtp://HOST:PORT, /dev/videoN, gige:[NAME], sim:SCENARIO, or a recording at its own pace.",
+    ),
+]
+MavlinkOption = Annotated[
+    str | None,
+    typer.Option("--mavlink", metavar="HOST:PORT", help="Send VISION_POSITION_ESTIMATE by UDP; needs --vehicle."),
+]
+ZenohOption = Annotated[
+    str | None,
+    typer.Option("--zenoh", metavar="ENDPOINT", help="Publish to ROS 2 by this zenoh router: tcp/127.0.0.1:7447."),
+]
+RerunOption = Annotated[
+    str | None,
+    typer.Option("--rerun", metavar="ADDRESS", help="Show in the viewer at rerun+http://HOST:PORT/proxy."),
+]
+RecordOption = Annotated[
+    list[Path] | None,
+    typer.Option("--record", metavar="FILE", help="Write a .mcap, .rrd or .mp4 file; may be repeated."),
+]
+HostOption = Annotated[
+    str,
+    typer.Option("--host", metavar="ADDRESS", help="Where page and Foxglove listen; with another, DDS goes out."),
+]
 
 
 @app.command(
@@ -57,13 +88,7 @@ _SHORT, _LONG, _ROWS = 2, 8, 256  # that wait for a network, and with and withou
     ),
 )
 def _serve(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="SOURCE",
-            help="rtsp://..., rtp://HOST:PORT, /dev/videoN, gige:[NAME], sim:SCENARIO, or a recording at its own pace.",
-        ),
-    ],
+    source: LiveSource,
     station: StationOption = None,
     camera: CameraOption = None,
     vehicle: VehicleOption = None,
@@ -73,32 +98,17 @@ def _serve(
     fps: Fps = None,
     config: ConfigOption = None,
     loop: Annotated[bool, typer.Option("--loop", help="Show a recording again and again.")] = False,
-    mavlink: Annotated[
-        str | None,
-        typer.Option(metavar="HOST:PORT", help="Send VISION_POSITION_ESTIMATE there by UDP; needs --vehicle."),
-    ] = None,
-    zenoh: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Publish to ROS 2 by this zenoh router: tcp/127.0.0.1:7447.")
-    ] = None,
+    mavlink: MavlinkOption = None,
+    zenoh: ZenohOption = None,
     dds: Annotated[bool, typer.Option("--dds", help="Publish to ROS 2 by DDS.")] = False,
     domain: Annotated[int, typer.Option(metavar="N", min=0, max=232, help="ROS_DOMAIN_ID.")] = 0,
     foxglove: Annotated[bool, typer.Option("--foxglove", help="Let Foxglove connect, at --foxglove-port.")] = False,
     foxglove_port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535)] = 8765,
-    rerun: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Show in the viewer at rerun+http://HOST:PORT/proxy.")
-    ] = None,
+    rerun: RerunOption = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write a run folder.")] = None,
-    record: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="Write a .mcap, .rrd or .mp4 file; may be repeated.")
-    ] = None,
+    record: RecordOption = None,
     health_port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="Of the health page.")] = 8780,
-    host: Annotated[
-        str,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Where the health page and Foxglove listen; DDS leaves this machine when it is another.",
-        ),
-    ] = _LOOPBACK,
+    host: HostOption = _LOOPBACK,
     force: Force = False,
 ) -> None:
     """Localize live and tell the vehicle, until stopped."""
@@ -121,6 +131,7 @@ def _serve(
             *_viewer_sinks(scene, foxglove_port if foxglove else None, rerun, host),
             *_file_sinks(scene, station_file, out, record or [], force),
         ]
+        sys.setswitchinterval(_SWITCH_S)
         stop, newest = threading.Event(), Newest()
         reader = Camera(opened.items, newest, live=opened.live, loop=loop, stop=stop)
         server = Server(localizer, reader, newest, sinks, stop)

@@ -55,6 +55,12 @@ VehicleOption = Annotated[
     Path | None, typer.Option("--vehicle", metavar="FILE", help="Vehicle file: frame names and the camera's mounting.")
 ]
 Topic = Annotated[str | None, typer.Option("--topic", metavar="NAME", help="The pictures of a bag that has several.")]
+SourceArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="SOURCE", help="Sequence or image folder, video, bag, sim:SCENARIO[:SEED], or a camera's address."
+    ),
+]
 Method = Annotated[str, typer.Option("--method", metavar="NAME", help="lumidock, or paper.")]
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="YAML file of settings that differ from the defaults.")

@@ -94,6 +94,9 @@ def camera_of(message: Message) -> Camera:
     model, coefficients = str(info.distortion_model), [float(value) for value in d]
     if not coefficients:
         model, coefficients = "plumb_bob", [0.0] * 5
+    most = {"plumb_bob": 5, "rational_polynomial": 8}.get(model, len(coefficients))
+    if not any(coefficients[most:]):  # OpenCV fills up to 14 with zeros
+        coefficients = coefficients[:most]
     size = int(info.width), int(info.height)
     return camera_from(message.topic, size, [float(value) for value in K], model, coefficients)
 
