@@ -86,6 +86,7 @@ HIDDEN = """
 import sys
 from pathlib import Path
 sys.modules[sys.argv[1]] = None
+from lumidock.errors import InputError
 from lumidock.streams.sources import open_source
 try:
     open_source(Path(sys.argv[2]))

@@ -26,6 +26,7 @@ from lumidock.station import Station
 from lumidock.streams.sources import Item
 
 _RECENT = 1000  # frames that rates and latencies are taken over
+_TICK_S = 0.2  # between looks at a sink that has nothing to do
 _RETRY_S = 1.0  # until a lost camera or a failed sink is tried again
 _CLOSING_S = 5.0  # a sink may take to write what is left
 _DRAWN_AT_M = 6.0
@@ -204,7 +205,7 @@ class Worker(threading.Thread):
         while True:
             with self._changed:
                 if not self._queue and not self._halt:
-                    self._changed.wait(_RETRY_S / 2)
+                    self._changed.wait(_TICK_S)
                 done = self._queue.popleft() if self._queue else None
                 if done is None and self._halt:
                     return

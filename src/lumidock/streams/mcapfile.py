@@ -34,6 +34,10 @@ class McapFile:
             self._mounted = True
         for message in ros2.messages(item, fix, latency_us, self._camera, self._vehicle, self._light_ids):
             self._write(message)
+        self.tick()
+
+    def tick(self) -> None:
+        """Give to the disk what has waited long enough, also when no frame comes."""
         if time.monotonic() - self._flushed > _FLUSH_S:
             self._writer.flush()
             self._flushed = time.monotonic()
