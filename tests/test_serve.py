@@ -291,7 +291,7 @@ def test_a_lost_camera_is_opened_again(monkeypatch):
     served.serve()
     assert len(tries) == 4
     assert served.camera.reconnects >= 3
-    assert [fix.frame for _, fix, _ in seen.got][:3] == ["1", "2", "3"]
+    assert [fix.frame for _, fix, _ in seen.got][:3] == ["1", "1.2", "2.3"]
 
 
 def test_a_recording_is_shown_at_its_own_pace_and_again(monkeypatch):

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lumidock.camera import Camera as Lens
-from lumidock.datatypes import Detections, Fix, Frame, Stage, Unusable
+from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import LumidockError
 from lumidock.pose import project_lights
 from lumidock.run import TwoDoors, process
@@ -76,7 +76,7 @@ class Camera(threading.Thread):
         super().__init__(name="camera", daemon=True)
         self._open, self._newest, self._live, self._loop, self._halt = open_items, newest, live, loop, stop
         self.frames, self.reconnects, self.problem, self.ended = 0, 0, "", False
-        self._offset_ns = 0
+        self._offset_ns = self._passes = 0
 
     def run(self) -> None:
         """Read until told to stop, or to the end of a recording."""
@@ -88,6 +88,7 @@ class Camera(threading.Thread):
                 self.problem = str(error)
             if not self._live and (not self._loop or self.problem):
                 break
+            self._passes += 1
             if self._live:
                 self.reconnects += 1
                 self._halt.wait(_RETRY_S)
@@ -104,21 +105,22 @@ class Camera(threading.Thread):
                 last_ns = max(last_ns, item.t_ns)
             self.frames += 1
             self.problem = ""
-            self._newest.put(_later(item, self._offset_ns))
+            self._newest.put(_of_pass(item, self._passes, self._offset_ns))
         if self._loop and first_ns is not None:
             self._offset_ns += last_ns - first_ns + _LOOP_PAUSE_NS
             self._halt.wait(_LOOP_PAUSE_NS * 1e-9)
 
 
-def _later(item: Item, offset_ns: int) -> Item:
-    if not offset_ns or item.t_ns is None:
+def _of_pass(item: Item, number: int, offset_ns: int) -> Item:
+    """The same frame with a name and a stamp of its own, when a source is read once more."""
+    if not number:
         return item
+    t_ns = None if item.t_ns is None else item.t_ns + offset_ns
     if isinstance(item, Frame):
-        return Frame(item.name, item.t_ns + offset_ns, item.image, item.attitude)
+        return replace(item, name=f"{number}.{item.name}", t_ns=item.t_ns + offset_ns)
     if isinstance(item, Unusable):
-        return Unusable(item.frame, item.t_ns + offset_ns, item.reason, item.text)
-    numbers = (item.uv, item.radius_px, item.flux, item.p_light, item.p_rear, item.cov_px2, item.attitude)
-    return Detections(item.frame, item.t_ns + offset_ns, *numbers)
+        return replace(item, frame=f"{number}.{item.frame}", t_ns=t_ns)
+    return replace(item, frame=f"{number}.{item.frame}", t_ns=item.t_ns + offset_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,7 +295,7 @@ class Server:
                 **{word: self.counts[word] for word in ("frames", "valid", "guide")},
                 "reasons": dict(self.reasons),
                 "last": None if last is None else {"status": last.status, "stage": last.stage, "reason": last.reason},
-                "latency_ms": percentiles([us / 1000.0 for us in self.latency_us]),
+                "latency_ms": percentiles([us / 1000.0 for us in list(self.latency_us)]),
             },
             "sinks": {
                 worker.name: {

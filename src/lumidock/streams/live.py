@@ -18,6 +18,14 @@ from lumidock.streams.sources import Item, Source
 _DEVICE = re.compile(r"/dev/video[0-9]{1,3}")
 
 
+_SINCE_EPOCH_NS = time.time_ns() - time.monotonic_ns()
+
+
+def now_ns() -> int:
+    """Time since the epoch, by the clock as it was at the start: setting it later does not make stamps jump."""
+    return _SINCE_EPOCH_NS + time.monotonic_ns()
+
+
 def open_live(address: str, *, gray: bool = False) -> Source | None:
     """A camera by its address: rtsp://..., rtp://HOST:PORT (H.264), /dev/videoN or gige:[NAME]; None for none of these.
 
@@ -45,7 +53,7 @@ def _device(path: str) -> Iterator[Item]:
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         number = 0
         while capture.grab():
-            t_ns = time.time_ns()
+            t_ns = now_ns()
             decoded, image = capture.retrieve()
             if decoded:
                 yield Frame(f"{number:06d}", t_ns, mono_if_gray(np.asarray(image, np.uint8)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import time
 from collections.abc import Iterator
 from urllib.parse import urlsplit
 
@@ -12,6 +11,7 @@ from av.error import FFmpegError
 
 from lumidock.datatypes import Frame
 from lumidock.errors import InputError
+from lumidock.streams.live import now_ns
 from lumidock.streams.sources import Item
 from lumidock.streams.video import picture_of
 
@@ -42,7 +42,7 @@ def frames_of(address: str, gray: bool) -> Iterator[Item]:
             stream.thread_type = "SLICE"  # threads over frames would hold some back
             for number, frame in enumerate(container.decode(stream)):
                 if isinstance(frame, av.VideoFrame) and not frame.is_corrupt:
-                    yield Frame(f"{number:06d}", time.time_ns(), picture_of(frame, gray))
+                    yield Frame(f"{number:06d}", now_ns(), picture_of(frame, gray))
     except (FFmpegError, IndexError, ValueError) as error:
         why = " ".join(str(getattr(error, "strerror", None) or error).split())
         raise InputError(f"{without_password(address)}: {why}") from None
