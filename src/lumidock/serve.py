@@ -30,7 +30,7 @@ _TICK_S = 0.2  # between looks at a sink that has nothing to do
 _RETRY_S = 1.0  # until a lost camera or a failed sink is tried again
 _CLOSING_S = 5.0  # a sink may take to write what is left
 _DRAWN_AT_M = 6.0
-_NICE = 10  # of threads that encode pictures, on Linux a matter of each thread
+_NICE = 10  # of viewers; on Linux a matter of each thread
 _LOOP_PAUSE_NS = 3_000_000_000  # between two passes over a recording: no track is carried across
 STALE_S = 0.25  # ArduPilot takes an estimate for lost after 0.3
 
@@ -150,11 +150,15 @@ class Worker(threading.Thread):
         queue: int,
         stale_s: float | None = None,
         pictures: bool = True,
+        patient: bool = False,
     ) -> None:
-        """Feed the sink that `open_sink` opens; without `pictures` it is given the frames' names and stamps alone."""
+        """Feed the sink that `open_sink` opens; without `pictures` it is given the frames' names and stamps alone.
+
+        A `patient` one, a viewer, leaves the processor to the others.
+        """
         super().__init__(name=name, daemon=True)
         self._open, self._queue, self._stale_s = open_sink, deque[Done](maxlen=queue), stale_s
-        self._pictures = pictures
+        self._pictures, self._patient = pictures, patient
         self._changed, self._halt = threading.Condition(), False
         self.sent, self.dropped, self.stale, self.errors, self.problem = 0, 0, 0, 0, ""
         self.delay_s = deque[float](maxlen=_RECENT)  # from the frame's arrival to the end of sending
@@ -175,7 +179,7 @@ class Worker(threading.Thread):
 
     def run(self) -> None:
         """Open, feed and close the sink, again and again if need be."""
-        if self._pictures:  # encoding them may wait; the next fix may not
+        if self._patient:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         while not self._over():
             try:

@@ -190,11 +190,12 @@ def _viewer_sinks(scene: Scene, foxglove_port: int | None, rerun: str | None, ho
         with extra("live"), extra("bag"):
             from lumidock.streams.foxglovelive import FoxgloveLive
         shared = (scene.camera, scene.vehicle, scene.station.ids)
-        workers.append(Worker("foxglove", partial(FoxgloveLive, host, foxglove_port, *shared), queue=_SHORT))
+        server = partial(FoxgloveLive, host, foxglove_port, *shared)
+        workers.append(Worker("foxglove", server, queue=_SHORT, patient=True))
     if rerun is not None:
         if not rerun.startswith("rerun+http"):
             raise InputError(f"--rerun {rerun}: wanted rerun+http://HOST:PORT/proxy")
-        workers.append(Worker("rerun", partial(open_rerun, rerun, scene), queue=_SHORT))
+        workers.append(Worker("rerun", partial(open_rerun, rerun, scene), queue=_SHORT, patient=True))
     return workers
 
 
