@@ -75,7 +75,7 @@ TYPES = {
     f"{PREFIX}/image/compressed": "sensor_msgs/msg/CompressedImage",
     f"{PREFIX}/annotations": "foxglove_msgs/msg/ImageAnnotations",
 }
-_NAMED, _SPURIOUS = (0.3, 1.0, 0.4, 1.0), (1.0, 0.25, 0.25, 1.0)
+_NAMED, _SPURIOUS, _CLEAR = (0.3, 1.0, 0.4, 1.0), (1.0, 0.25, 0.25, 1.0), (0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,21 +225,16 @@ def _compressed(image: Image, t_ns: int, frames: _Frames) -> Any:  # noqa: ANN40
 def _annotations(fix: Fix, t_ns: int, light_ids: tuple[str, ...]) -> Any:  # noqa: ANN401
     """A ring around each detection, and the name of its light. Foxglove counts pixels from the corner of the first."""
     circles, texts, time = [], [], _time(t_ns)
-    color = {name: _make("foxglove_msgs/msg/Color", *rgba) for name, rgba in _COLORS.items()}
-    match = fix.match
-    for i in range(len(match.detections) if match else 0):
-        assert match is not None
-        light, (u, v) = int(match.light[i]), match.detections.uv[i] + 0.5
-        diameter = 2.0 * max(8.0, 1.6 * float(np.nan_to_num(match.detections.radius_px[i])) + 4.0)
-        ring = color["named" if light >= 0 else "spurious"]
+    green, red, clear = (_make("foxglove_msgs/msg/Color", *rgba) for rgba in (_NAMED, _SPURIOUS, _CLEAR))
+    spots = fix.match.detections if fix.match else Detections.from_uv(fix.frame, t_ns, np.empty((0, 2)))
+    named = fix.match.light if fix.match else np.empty(0, np.int64)
+    for (u, v), radius, light in zip(spots.uv + 0.5, spots.radius_px, named, strict=True):
+        diameter = 2.0 * max(8.0, 1.6 * float(np.nan_to_num(radius)) + 4.0)
+        color = green if light >= 0 else red
         at = _make("foxglove_msgs/msg/Point2", float(u), float(v))
-        circles.append(_make("foxglove_msgs/msg/CircleAnnotation", time, at, diameter, 2.0, color["clear"], ring))
+        circles.append(_make("foxglove_msgs/msg/CircleAnnotation", time, at, diameter, 2.0, clear, color))
         if light >= 0:
             beside = _make("foxglove_msgs/msg/Point2", float(u) + diameter / 2.0 + 2.0, float(v))
-            texts.append(
-                _make("foxglove_msgs/msg/TextAnnotation", time, beside, light_ids[light], 16.0, ring, color["clear"])
-            )
+            words = (time, beside, light_ids[light], 16.0, color, clear)
+            texts.append(_make("foxglove_msgs/msg/TextAnnotation", *words))
     return _make("foxglove_msgs/msg/ImageAnnotations", circles, [], texts)
-
-
-_COLORS = {"named": _NAMED, "spurious": _SPURIOUS, "clear": (0.0, 0.0, 0.0, 0.0)}
