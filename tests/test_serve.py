@@ -26,7 +26,7 @@ from lumidock.datatypes import Fix, Frame
 from lumidock.geometry import se3_exp, se3_inverse
 from lumidock.serve import Camera, Done, Newest, Server, Taken, Worker
 from lumidock.streams.healthpage import HealthPage
-from lumidock.streams.mavlink import R_FRD_DOCK, Mavlink, covariance_of_body, estimate, roll_pitch_yaw
+from lumidock.streams.mavlink import R_LOCAL_DOCK, Mavlink, covariance_of_body, estimate, roll_pitch_yaw
 from lumidock.streams.sources import open_source
 from lumidock.vehicle import Vehicle
 
@@ -71,8 +71,8 @@ def test_position_and_angles_are_those_of_the_body(T_dock_cam, T_body_cam):
     fix = Fix("a", 0, "tracking", "rear", T_dock_cam=T_dock_cam)
     message = estimate(common.MAVLink(None), fix, Vehicle(T_body_cam), 0)
     T_dock_body = T_dock_cam @ np.linalg.inv(T_body_cam)
-    assert_close([message.x, message.y, message.z], R_FRD_DOCK @ T_dock_body[:3, 3], atol=1e-9)
-    wanted = R_FRD_DOCK @ T_dock_body[:3, :3] @ np.diag([1, -1, -1])
+    assert_close([message.x, message.y, message.z], R_LOCAL_DOCK @ T_dock_body[:3, 3], atol=1e-9)
+    wanted = R_LOCAL_DOCK @ T_dock_body[:3, :3] @ np.diag([1, -1, -1])
     found = Rotation.from_euler("ZYX", [message.yaw, message.pitch, message.roll]).as_matrix()
     assert_close(found, wanted, atol=1e-6)
 
@@ -85,8 +85,8 @@ def test_the_covariance_is_carried_to_the_body(T_dock_cam, T_body_cam):
         moved[:3, 3] += error[:3]
         moved[:3, :3] = se3_exp(np.concatenate([np.zeros(3), error[3:]]))[:3, :3] @ T_dock_cam[:3, :3]
         T_dock_body = moved @ se3_inverse(T_body_cam)
-        R = R_FRD_DOCK @ T_dock_body[:3, :3] @ np.diag([1, -1, -1])
-        return np.concatenate([R_FRD_DOCK @ T_dock_body[:3, 3], roll_pitch_yaw(R)])
+        R = R_LOCAL_DOCK @ T_dock_body[:3, :3] @ np.diag([1, -1, -1])
+        return np.concatenate([R_LOCAL_DOCK @ T_dock_body[:3, 3], roll_pitch_yaw(R)])
 
     _, pitch, yaw = pose(np.zeros(6))[3:]
     if abs(pitch) > 1.2:

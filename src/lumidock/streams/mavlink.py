@@ -18,8 +18,8 @@ from lumidock.datatypes import Array, Detections, Fix, Frame, Unusable
 from lumidock.geometry import se3_inverse, skew
 from lumidock.vehicle import Vehicle
 
-R_FRD_DOCK = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-_R_FLU_FRD = np.diag([1.0, -1.0, -1.0])  # of the body: REP-103 to aerospace axes
+R_LOCAL_DOCK = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_R_BODY_AERO = np.diag([1.0, -1.0, -1.0])  # of the body: REP-103 to aerospace axes
 _SYSTEM, _HEARTBEAT_S = 1, 1.0
 _UNKNOWN = float("nan")  # in the first entry of a covariance
 
@@ -71,8 +71,8 @@ def estimate(link: common.MAVLink, fix: Fix, vehicle: Vehicle, resets: int) -> c
     """The message of a valid fix: position and roll, pitch, yaw of the body, and their covariance."""
     assert fix.T_dock_cam is not None
     T_dock_body = fix.T_dock_cam @ se3_inverse(vehicle.T_body_cam)
-    position = R_FRD_DOCK @ T_dock_body[:3, 3]
-    R = R_FRD_DOCK @ T_dock_body[:3, :3] @ _R_FLU_FRD
+    position = R_LOCAL_DOCK @ T_dock_body[:3, 3]
+    R = R_LOCAL_DOCK @ T_dock_body[:3, :3] @ _R_BODY_AERO
     roll, pitch, yaw = roll_pitch_yaw(R)
     covariance = [_UNKNOWN] + [0.0] * 20
     if fix.covariance is not None:
@@ -96,9 +96,9 @@ def covariance_of_body(covariance: Array, lever_dock: Array, pitch: float, yaw: 
     error w moves the body by w x lever; w = E (d_roll, d_pitch, d_yaw), which has no inverse where pitch is 90 degrees.
     """
     J = np.zeros((6, 6))
-    J[:3, :3] = R_FRD_DOCK
-    J[:3, 3:] = -R_FRD_DOCK @ skew(lever_dock)
+    J[:3, :3] = R_LOCAL_DOCK
+    J[:3, 3:] = -R_LOCAL_DOCK @ skew(lever_dock)
     cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
     E = np.array([[cy * cp, -sy, 0.0], [sy * cp, cy, 0.0], [-sp, 0.0, 1.0]])
-    J[3:, 3:] = np.linalg.pinv(E) @ R_FRD_DOCK
+    J[3:, 3:] = np.linalg.pinv(E) @ R_LOCAL_DOCK
     return np.asarray(J @ covariance @ J.T)
