@@ -12,11 +12,11 @@ from lumidock.datatypes import Detections, Fix, Frame, Unusable
 from lumidock.streams import ros2
 from lumidock.vehicle import Vehicle
 
-_FLUSH_S = 0.5  # what a killed run may lose
+_FLUSH_S = 0.2  # what a killed run may lose, and what the next look at the clock takes
 
 
 class McapFile:
-    """Writes every frame's messages; a file that was cut short can be read up to its last half second."""
+    """Writes every frame's messages; a file that was cut short can be read but for its last moment."""
 
     def __init__(self, path: Path, camera: Camera, vehicle: Vehicle | None, light_ids: tuple[str, ...]) -> None:
         """Start the file, replacing one that is there."""
