@@ -8,54 +8,36 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import yaml
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    NonNegativeFloat,
-    PositiveFloat,
-    PositiveInt,
-    model_validator,
-)
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from lumidock.datatypes import Array
 from lumidock.errors import InputError
+from lumidock.sim.knobs import (
+    Angle,
+    Around,
+    Counts,
+    Daylight,
+    Distance,
+    Interval,
+    Lamps,
+    Lengths,
+    Lens,
+    Output,
+    Probability,
+    Section,
+    Sensor,
+    Stream,
+    Triple,
+    Water,
+)
 from lumidock.yamlfile import read_mapping, validate
 
 R_DOCK_CAM_HEAD_ON = np.diag([1.0, -1.0, -1.0])
 _MAX_FRAMES = 100_000
 _BETWEEN_DRAWS_S = 60.0  # longer than any history is kept
-Distance = Annotated[float, Field(ge=-1000.0, le=1000.0)]
-Count = Annotated[int, Field(ge=0, le=1000)]
-Triple = tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat]
-Probability = Annotated[float, Field(ge=0.0, le=1.0)]
-Angle = Annotated[float, Field(ge=0.0, le=180.0)]
 
 
-def _pair(value: object) -> object:
-    """One number as the range from it to itself."""
-    return value if isinstance(value, (list, tuple)) else (value, value)
-
-
-def _rising(bounds: tuple[Any, Any]) -> tuple[Any, Any]:
-    if bounds[0] > bounds[1]:
-        raise ValueError("wanted the lower bound first")
-    return bounds
-
-
-# a number or a range [lo, hi], from which a draw is uniform
-Counts = Annotated[tuple[Count, Count], BeforeValidator(_pair), AfterValidator(_rising)]
-Lengths = Annotated[tuple[PositiveFloat, PositiveFloat], BeforeValidator(_pair), AfterValidator(_rising)]
-Interval = Annotated[tuple[NonNegativeFloat, NonNegativeFloat], AfterValidator(_rising)]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Path3D(_Section):
+class Path3D(Section):
     """The camera's path.
 
     `approach` runs along the dock's axis; `rectangle` goes once round at a constant z; `draws` are poses that have
@@ -111,42 +93,21 @@ class Path3D(_Section):
         return self
 
 
-class Water(_Section):
-    """Absorption and scattering 1/m in three bands (455, 530, 610 nm); the defaults are Jerlov type III.
-
-    Source: Williamson & Hollins 2022; Solonenko & Mobley 2015.
-    """
-
-    absorption: Triple = (0.107, 0.081, 0.287)
-    scattering: Triple = (0.308, 0.291, 0.277)
-    ambient_e: Triple = (25.0, 30.0, 8.0)  # electrons per pixel and exposure of 2 ms, in B, G, R
-
-
-class Sensor(_Section):
-    """IMX264 behind 7.2 mm f/2.8; source: Sony's data sheet figures as measured to EMVA 1288."""
-
-    exposure_ms: PositiveFloat = 2.0
-    full_well_e: PositiveFloat = 10700.0
-    read_noise_e: NonNegativeFloat = 2.3
-    gamma: PositiveFloat = 2.2
-    blur_px: PositiveFloat = 0.7  # 1 sigma of the lens
-
-
-class Faults(_Section):
+class Faults(Section):
     """What goes wrong with the lights."""
 
     missing: Counts = (0, 0)  # front lights dark in each frame, drawn anew; the same ones in frames that are held
     spurious: Counts = (0, 0)  # lights that wander over the whole picture, drawn for a run; in draws anew in each frame
 
 
-class AttitudeSensor(_Section):
+class AttitudeSensor(Section):
     """The vehicle's own compass and tilt sensors, 1 sigma about each axis."""
 
     bias_deg: PositiveFloat = 2.0  # one for a run
     noise_deg: NonNegativeFloat = 0.1  # in each frame
 
 
-class BlackOuts(_Section):
+class BlackOuts(Section):
     """Times in which no spot is seen at all."""
 
     at_s: tuple[Interval, ...] = ()  # from and to, since the start
@@ -154,7 +115,7 @@ class BlackOuts(_Section):
     length_s: Lengths = (0.2, 2.0)  # ... and how long each is
 
 
-class Spots(_Section):
+class Spots(Section):
     """Bare detections, made without rendering. What is drawn for a run is drawn for each draw of a path of draws."""
 
     noise_px: NonNegativeFloat = 0.5
@@ -175,14 +136,20 @@ class Spots(_Section):
     attitude: AttitudeSensor | None = None
 
 
-class Scenario(_Section):
+class Scenario(Section):
     """Everything that a seed does not decide."""
 
     name: str = "approach"
     about: str = ""
     path: Path3D = Path3D()
     water: Water = Water()
+    daylight: Daylight = Daylight()
+    lamps: Lamps = Lamps()
+    around: Around = Around()
+    lens: Lens = Lens()
     sensor: Sensor = Sensor()
+    output: Output = Output()
+    stream: Stream = Stream()
     faults: Faults = Faults()
     spots: Spots = Spots()
     config: dict[str, Any] = {}  # settings of the method that the scenario needs, as in a configuration file

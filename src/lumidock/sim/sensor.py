@@ -1,30 +1,70 @@
-"""The sensor: electrons on the mosaic -> an 8-bit colour picture."""
+"""The sensor: electrons on the mosaic -> 12-bit levels -> what a camera hands out."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from lumidock.datatypes import Array, Image
-from lumidock.sim.scenario import Sensor
+from lumidock.datatypes import Array
+from lumidock.sim.knobs import Output, Sensor
 
-_LEVELS = 4095  # 12 bit
+LEVELS = 4095  # 12 bit
+_MONO16_SHIFT = 4  # 12 bit in the upper part of 16
+_TO_BGR = {
+    "rggb": cv2.COLOR_BayerRGGB2BGR,
+    "bggr": cv2.COLOR_BayerBGGR2BGR,
+    "grbg": cv2.COLOR_BayerGRBG2BGR,
+    "gbrg": cv2.COLOR_BayerGBRG2BGR,
+}
 
 
-def picture(electrons: Array, sensor: Sensor, rng: np.random.Generator) -> Image:
-    """BGR picture (H, W, 3) of expected electrons (H, W) on an RGGB mosaic.
+def electrons_per_level(sensor: Sensor) -> float:
+    """Electrons behind one level of 12 bit."""
+    return float(sensor.full_well_e / LEVELS / 10.0 ** (sensor.gain_db / 20.0))
 
-    Shot noise (Gaussian limit) and read noise, full well, 12 bit, demosaicing, gamma. Source: EMVA 1288 camera model.
+
+def saturation_e(sensor: Sensor) -> float:
+    """Electrons beyond which a pixel tells nothing more: the full well, or the end of the scale at this gain."""
+    return min(sensor.full_well_e, LEVELS * electrons_per_level(sensor))
+
+
+def read_out(electrons: Array, sensor: Sensor, rng: np.random.Generator) -> NDArray[np.uint16]:
+    """12-bit levels (H, W) of expected electrons (H, W).
+
+    Shot noise (Gaussian limit), full well, read noise, gain, rounding. Source: EMVA 1288, release 4, camera model.
     """
     levels = rng.standard_normal(electrons.shape, np.float32)  # in place from here on: noise, electrons, levels
     levels *= np.sqrt(electrons + np.float32(sensor.read_noise_e**2))
     levels += electrons
-    levels *= np.float32(_LEVELS / sensor.full_well_e)
-    raw = np.clip(np.rint(levels, out=levels), 0, _LEVELS).astype(np.uint16)
-    bgr = cv2.demosaicing(raw, cv2.COLOR_BayerRGGB2BGR)
-    return np.asarray(_gamma_table(sensor.gamma)[bgr])
+    np.minimum(levels, np.float32(sensor.full_well_e), out=levels)
+    levels *= np.float32(1.0 / electrons_per_level(sensor))
+    return np.asarray(np.clip(np.rint(levels, out=levels), 0, LEVELS).astype(np.uint16))
 
 
-def _gamma_table(gamma: float) -> Image:
-    linear = np.arange(_LEVELS + 1) / _LEVELS
+def picture(raw: NDArray[np.uint16], sensor: Sensor, output: Output) -> np.ndarray:
+    """The picture a camera gives: (H, W, 3) bgr8, or (H, W) mono8, mono16, bayer8, bayer16.
+
+    8-bit pictures have the gamma of the knob, except raw mosaics; 16-bit ones are linear.
+    """
+    if output.pixels == "bayer16":
+        return raw << _MONO16_SHIFT
+    if output.pixels == "bayer8":
+        return (raw >> _MONO16_SHIFT).astype(np.uint8)
+    developed = cv2.demosaicing(raw, _TO_BGR[output.pattern]) if output.color else raw
+    if output.color and output.pixels != "bgr8":
+        developed = cv2.cvtColor(developed, cv2.COLOR_BGR2GRAY)
+    if output.pixels == "mono16":
+        return np.asarray(developed << _MONO16_SHIFT)
+    return np.asarray(_gamma_table(sensor.gamma)[developed])
+
+
+def hot_pixels(sensor: Sensor, shape: tuple[int, int], rng: np.random.Generator) -> tuple[Array, Array]:
+    """Rows and columns (2, K) of pixels with a large dark current, and that (K,) in electrons a second."""
+    at = rng.integers(0, np.array(shape)[:, None], (2, sensor.hot_pixels))
+    return at, np.exp(rng.uniform(*np.log(sensor.hot_e_s), sensor.hot_pixels))
+
+
+def _gamma_table(gamma: float) -> np.ndarray:
+    linear = np.arange(LEVELS + 1) / LEVELS
     return np.round(255.0 * linear ** (1.0 / gamma)).astype(np.uint8)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import os
+import shutil
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -16,17 +18,32 @@ import cv2
 import numpy as np
 
 from lumidock.camera import Camera, save_camera
-from lumidock.datatypes import Array, Image, Indices
-from lumidock.errors import LumidockError
+from lumidock.datatypes import Array, Indices
+from lumidock.errors import InputError, LumidockError
 from lumidock.geometry import quat_xyzw_from_rotation
-from lumidock.sim import optics, sensor
-from lumidock.sim.scenario import Scenario, spurious_paths, trajectory
-from lumidock.sim.spots import SpotFrame, dark_lights, spot_frames
+from lumidock.sim.frames import Moment, Shot, Studio
+from lumidock.sim.lens import Lens, calibrated_in_water
+from lumidock.sim.optics import Emitters
+from lumidock.sim.plan import Plan, controlled, metered, plan_of
+from lumidock.sim.scenario import Scenario
+from lumidock.sim.spots import SpotFrame, spot_frames
+from lumidock.sim.stream import OVER_EXPOSED, Row, cut, rows_of
+from lumidock.sim.water import green_index
 from lumidock.station import Station
 
-_JPEG_QUALITY = 95
-_VISIBLE_SNR = 8.0
+_VISIBLE_SNR, _NOTED_SNR = 8.0, 4.0
+_VIDEO_CODEC = "mp4v"
+_PNG_OPTIONS = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 Progress = Callable[[int, int], None]
+Line = list[object]
+
+
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """Truth of one frame: lines for lights_truth.csv and spurious_truth.csv, without the frame's name."""
+
+    lights: list[Line]
+    spurious: list[Line]
 
 
 def render_frame(
@@ -37,16 +54,27 @@ def render_frame(
     strays: Array,
     dark: Indices,
     rng: np.random.Generator,
-) -> tuple[Image, optics.Lamps, Array]:
-    """One picture (H, W, 3) bgr8, its lamps and their matched-filter SNR (M,).
+) -> tuple[np.ndarray, Emitters, Array]:
+    """One picture of a still camera, its lamps and their matched-filter SNR (M,).
 
     `strays` (S, 2) px are lamps that belong to no dock, `dark` the lights that are out in this frame.
     """
-    seen = optics.lamps(scenario, station, camera, T_dock_cam)
-    seen.lit[dark] = False
-    snr = optics.matched_filter_snr(scenario, seen)
-    electrons = optics.expose(scenario, optics.with_strays(seen, strays), camera)
-    return sensor.picture(electrons, scenario.sensor, rng), seen, snr
+    lens = Lens.of(scenario.lens, camera, green_index(scenario.water))
+    studio, m = Studio(scenario, station, lens), len(station)
+    moment = Moment(
+        t_s=0.0,
+        exposure_s=scenario.sensor.exposure_ms * 1e-3,
+        T_dock_cam=T_dock_cam,
+        T_dock_later=T_dock_cam,
+        p_dock=station.p_dock,
+        transmission=np.ones(m),
+        dark=np.asarray(dark, np.int64),
+        strays=strays,
+        surface=scenario.around.surface,
+    )
+    shot = studio.shoot(moment)
+    own = Emitters(*(getattr(shot.seen, name)[:m] for name in Emitters.__slots__))
+    return studio.develop(shot, rng), own, shot.snr[:m]
 
 
 def write_rendered(
@@ -56,24 +84,40 @@ def write_rendered(
     seed: int,
     out: Path,
     *,
+    video: bool = False,
     workers: int | None = None,
     progress: Progress = lambda _done, _total: None,
 ) -> int:
-    """Render a scenario into the sequence folder `out`; the same bytes whatever `workers`. Returns the frame count."""
-    t_ns, poses = trajectory(scenario, np.random.default_rng([seed, 0]))
+    """Render a scenario into the sequence folder `out`; the same bytes whatever `workers`. Returns the number of rows.
+
+    With `video` the pictures go into video.mp4 instead of frames/.
+    """
+    plan = plan_of(scenario, station, camera, seed)
+    rows = rows_of(scenario.stream, plan.course.t_ns, np.random.default_rng([seed, 6]))
+    if not rows:
+        raise InputError(f"{scenario.name}: every frame is dropped")
     (out / "frames").mkdir(parents=True, exist_ok=True)
-    job = partial(_write_frame, scenario, station, camera, seed, out)
-    rows = []
+    control = scenario.sensor.auto_exposure
+    total = len(rows) + (len(plan) if control else 0)
     with _mapping(workers or os.cpu_count() or 1) as mapping:
-        for row in mapping(job, range(len(t_ns))):
-            rows.append(row)
-            progress(len(rows), len(t_ns))
-    names = [f"{number:06d}" for number in range(len(t_ns))]
-    _write_common(out, camera, names, [f"{name}.jpg" for name in names], t_ns, poses)
-    lights_truth, spurious = zip(*rows, strict=True)
-    _write_lights_truth(out, names, lights_truth)
-    _write_spurious(out, names, spurious)
-    return len(t_ns)
+        if control:
+            light = _counted(mapping(partial(metered, plan), range(len(plan))), progress, 0, total)
+            plan = replace(plan, exposure_s=controlled(plan, control, light))
+        job = partial(_write_frame, plan, out)
+        written = _counted(mapping(job, rows), progress, total - len(rows), total)
+    _write_truth(plan, rows, written, out)
+    if video:
+        _into_video(rows, out, scenario)
+    return len(rows)
+
+
+def _counted(results: Iterable[Any], progress: Progress, done: int, total: int) -> list[Any]:
+    """All results, with `progress` told of each."""
+    collected = []
+    for result in results:
+        collected.append(result)
+        progress(done + len(collected), total)
+    return collected
 
 
 @contextmanager
@@ -87,40 +131,104 @@ def _mapping(workers: int) -> Iterator[Callable[..., Iterable[Any]]]:
         yield partial(pool.map, chunksize=4)
 
 
-def _write_frame(
-    scenario: Scenario, station: Station, camera: Camera, seed: int, out: Path, number: int
-) -> tuple[list[list[object]], Array]:
-    """Render one frame to its file; returns its rows of lights_truth.csv and its spurious pixels (S, 2)."""
-    t_ns, poses = trajectory(scenario, np.random.default_rng([seed, 0]))
-    size = (camera.width, camera.height)
-    strays = spurious_paths(scenario, t_ns, size, np.random.default_rng([seed, 2]))[number]
-    rng = np.random.default_rng([seed, 3, number])
-    front = station.lights_of(station.layers_front_to_rear()[0])
-    lit = optics.lamps(scenario, station, camera, poses[number]).lit
-    dark = dark_lights(scenario, front[lit[front]], rng)
-    image, seen, snr = render_frame(scenario, station, camera, poses[number], strays, dark, rng)
-    path = out / "frames" / f"{number:06d}.jpg"
-    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]):
+def _write_frame(plan: Plan, out: Path, row: Row) -> _Written:
+    """Render the picture of one row to its file, and say what is in it."""
+    scenario = plan.scenario
+    studio, moment = plan.studio(row.shows), plan.moment(row.shows)
+    if row.fault == "over_exposed":
+        moment = replace(moment, exposure_s=moment.exposure_s * OVER_EXPOSED)
+    shot = studio.shoot(moment)
+    image = studio.develop(shot, np.random.default_rng([plan.seed, 9, row.shows]))
+    if row.fault in ("black", "white"):
+        image[...] = 0 if row.fault == "black" else np.iinfo(image.dtype).max
+    path = out / "frames" / _file_of(row, scenario)
+    options = [cv2.IMWRITE_JPEG_QUALITY, scenario.output.quality] if scenario.output.file == "jpg" else _PNG_OPTIONS
+    if not cv2.imwrite(str(path), image, options):
         raise LumidockError(f"{path}: cannot be written")
-    rows: list[list[object]] = [
+    if row.fault == "half_written":
+        cut(path)
+    lost = row.fault in ("black", "white", "half_written")
+    return _truth_of(studio, shot, lost)
+
+
+def _file_of(row: Row, scenario: Scenario) -> str:
+    return f"{row.name}.{scenario.output.file}"
+
+
+def _truth_of(studio: Studio, shot: Shot, lost: bool) -> _Written:
+    """What truth says of one picture; in one that is `lost` nothing is visible."""
+    seen, m = shot.seen, len(studio.station)
+    snr = np.zeros(len(seen)) if lost else shot.snr
+    lights: list[Line] = [
         [light, f"{u:.4f}", f"{v:.4f}", int(s > _VISIBLE_SNR), f"{s:.2f}"]
-        for light, (u, v), s in zip(station.ids, seen.uv, snr, strict=True)
+        for light, (u, v), s in zip(studio.station.ids, seen.uv[:m], snr[:m], strict=True)
         if np.isfinite([u, v]).all()
     ]
-    return rows, strays
+    noted = (snr > _NOTED_SNR) | (seen.kind == "injected")
+    noted[:m] = False
+    spurious: list[Line] = [
+        [str(seen.kind[i]), f"{seen.uv[i, 0]:.4f}", f"{seen.uv[i, 1]:.4f}"] for i in np.flatnonzero(noted)
+    ]
+    hot = studio.hot_at[::-1].T if not lost else studio.hot_at[::-1].T[:0]
+    spurious += [["hot_pixel", f"{u:.4f}", f"{v:.4f}"] for u, v in hot]
+    return _Written(lights, spurious)
+
+
+def _write_truth(plan: Plan, rows: list[Row], written: list[_Written], out: Path) -> None:
+    """Calibration, stamps and truth, a row for each frame of the sequence."""
+    scenario = plan.scenario
+    lens = plan.studio(0).lens
+    save_camera(calibrated_in_water(lens, plan.camera), out / "camera.yaml")
+    raw = scenario.output.pixels.startswith("bayer")
+    columns = ("frame", "file", "t_ns", *(("encoding",) if raw else ()))
+    encoding = [f"bayer_{scenario.output.pattern}{scenario.output.pixels.removeprefix('bayer')}"] if raw else []
+    _write_csv(out / "timestamps.csv", columns, ([r.name, _file_of(r, scenario), r.t_ns, *encoding] for r in rows))
+    once = {row.number: (row, truth) for row, truth in zip(rows, written, strict=True)}  # a doubled row has one truth
+    names = [row.name for row, _ in once.values()]
+    _write_poses(out, names, [row.t_ns for row, _ in once.values()], plan.course.T_dock_cam[list(once)])
+    _write_lights_truth(out, names, [truth.lights for _, truth in once.values()])
+    _write_spurious(out, names, [truth.spurious for _, truth in once.values()])
+    if any(row.fault for row in rows):
+        _write_csv(out / "stream_truth.csv", ("frame", "fault"), ([r.name, r.fault] for r in rows if r.fault))
+
+
+def _into_video(rows: list[Row], out: Path, scenario: Scenario) -> None:
+    """Make a video of the pictures, which are then gone; what cannot be decoded is left out as a recorder would."""
+    video, writer = out / "video.mp4", None
+    for row in rows:
+        image = cv2.imread(str(out / "frames" / _file_of(row, scenario)), cv2.IMREAD_COLOR)
+        if image is None:
+            continue
+        if writer is None:
+            codec, fps = cv2.VideoWriter.fourcc(*_VIDEO_CODEC), 1.0 / scenario.path.frame_interval_s
+            writer = cv2.VideoWriter(str(video), codec, fps, (image.shape[1], image.shape[0]))
+        writer.write(image)
+    if writer is None:
+        raise LumidockError(f"{video}: no picture to put into it")
+    writer.release()
+    shutil.rmtree(out / "frames")
 
 
 def write_detections(scenario: Scenario, station: Station, camera: Camera, seed: int, out: Path) -> int:
-    """Write a scenario as bare detections into the folder `out`; returns the frame count."""
+    """Write a scenario as bare detections into the folder `out`; returns the frame count.
+
+    Raises: InputError where the scenario has a port, which bare detections do not know.
+    """
+    if scenario.lens.port is not None:
+        raise InputError(f"{scenario.name}: a flat port is only rendered, it has no bare detections")
     out.mkdir(parents=True, exist_ok=True)
     frames = list(spot_frames(scenario, station, camera, seed))
     names = [frame.detections.frame for frame in frames]
-    t_ns = np.array([frame.detections.t_ns for frame in frames])
+    t_ns = [frame.detections.t_ns for frame in frames]
     poses = np.array([frame.T_dock_cam for frame in frames])
-    _write_common(out, camera, names, [""] * len(names), t_ns, poses)
+    save_camera(camera, out / "camera.yaml")
+    _write_csv(
+        out / "timestamps.csv", ("frame", "file", "t_ns"), ([name, "", t] for name, t in zip(names, t_ns, strict=True))
+    )
+    _write_poses(out, names, t_ns, poses)
     _write_csv(out / "detections.csv", DETECTION_COLUMNS, _detection_rows(frames))
     _write_lights_truth(out, names, [_spot_truth(frame, station) for frame in frames])
-    _write_spurious(out, names, [frame.detections.uv[frame.light < 0] for frame in frames])
+    _write_spurious(out, names, [_spot_spurious(frame) for frame in frames])
     return len(frames)
 
 
@@ -134,21 +242,21 @@ def _detection_rows(frames: list[SpotFrame]) -> Iterator[list[object]]:
             yield [d.frame, f"{u:.4f}", f"{v:.4f}", "", "", "1", f"{p_rear:.3f}"]
 
 
-def _spot_truth(frame: SpotFrame, station: Station) -> list[list[object]]:
+def _spot_spurious(frame: SpotFrame) -> list[Line]:
+    return [["injected", f"{u:.4f}", f"{v:.4f}"] for u, v in frame.detections.uv[frame.light < 0]]
+
+
+def _spot_truth(frame: SpotFrame, station: Station) -> list[Line]:
     """A light is visible when it made a detection; bare detections have no signal-to-noise ratio."""
-    rows: list[list[object]] = []
+    rows: list[Line] = []
     for i in np.flatnonzero(frame.in_view):
         u, v = frame.uv[i]
         rows.append([station.ids[i], f"{u:.4f}", f"{v:.4f}", int(i in frame.light), ""])
     return rows
 
 
-def _write_common(
-    out: Path, camera: Camera, names: list[str], frame_files: list[str], t_ns: np.ndarray, poses: Array
-) -> None:
-    """Calibration, stamps and true poses."""
-    save_camera(camera, out / "camera.yaml")
-    _write_csv(out / "timestamps.csv", ("frame", "file", "t_ns"), zip(names, frame_files, t_ns, strict=True))
+def _write_poses(out: Path, names: list[str], t_ns: Iterable[int], poses: Array) -> None:
+    """True poses."""
     columns = ("frame", "t_ns", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
     rows = (
         [name, t, *(f"{value:.9f}" for value in (*T[:3, 3], *quat_xyzw_from_rotation(T[:3, :3])))]
@@ -157,7 +265,7 @@ def _write_common(
     _write_csv(out / "truth.csv", columns, rows)
 
 
-def _write_lights_truth(out: Path, names: list[str], rows: Iterable[list[list[object]]]) -> None:
+def _write_lights_truth(out: Path, names: list[str], rows: Iterable[list[Line]]) -> None:
     columns = ("frame", "light", "u_px", "v_px", "visible", "snr")
     _write_csv(
         out / "lights_truth.csv",
@@ -166,12 +274,9 @@ def _write_lights_truth(out: Path, names: list[str], rows: Iterable[list[list[ob
     )
 
 
-def _write_spurious(out: Path, names: list[str], pixels: Iterable[Array]) -> None:
-    columns = ("frame", "kind", "u_px", "v_px")
-    rows = (
-        [name, "injected", f"{u:.4f}", f"{v:.4f}"] for name, group in zip(names, pixels, strict=True) for u, v in group
-    )
-    _write_csv(out / "spurious_truth.csv", columns, rows)
+def _write_spurious(out: Path, names: list[str], lines: Iterable[list[Line]]) -> None:
+    rows = ([name, *line] for name, group in zip(names, lines, strict=True) for line in group)
+    _write_csv(out / "spurious_truth.csv", ("frame", "kind", "u_px", "v_px"), rows)
 
 
 def _write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:

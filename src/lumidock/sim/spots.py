@@ -53,8 +53,8 @@ class SpotFrame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Course:
-    """Where the camera is.
+class Course:
+    """Where the camera is, in N frames of G runs.
 
     `t_ns` (N,), `T_dock_cam` (N, 4, 4), the `run` (N,) that each frame belongs to and its `step` (N,) there;
     `missing_from` (N,) is the frame with the same missing lights; `surface_m` (G,) how high the water stands.
@@ -69,8 +69,8 @@ class _Course:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _World:
-    """What stays so through a run.
+class World:
+    """What stays so through a run; G runs, M lights, N frames.
 
     Where the lights really are, `p_dock` (G, M, 3) m, how far they are seen, `reach_m` (G, M), and which are `dead`
     (G, M); relative `focal` (G,) and `center_px` (G, 2) errors of the lens; which frames are `black` (N,).
@@ -116,8 +116,8 @@ def spot_frames(scenario: Scenario, station: Station, camera: Camera, seed: int)
 
     Raises: InputError when no pose has the front layer in view.
     """
-    course = _course(scenario, station, camera, np.random.default_rng([seed, 0]))
-    world = _world(scenario, station, course, np.random.default_rng([seed, 4]))
+    course = course_of(scenario, station, camera, np.random.default_rng([seed, 0]))
+    world = world_of(scenario, station, course, np.random.default_rng([seed, 4]))
     wander = _wandering(scenario, camera, course, np.random.default_rng([seed, 2]))
     rng = np.random.default_rng([seed, 1])
     uv, visible = _shown(scenario, station, camera, course, world)
@@ -136,16 +136,17 @@ def spot_frames(scenario: Scenario, station: Station, camera: Camera, seed: int)
     )
 
 
-def _course(scenario: Scenario, station: Station, camera: Camera, rng: np.random.Generator) -> _Course:
+def course_of(scenario: Scenario, station: Station, camera: Camera, rng: np.random.Generator) -> Course:
+    """The camera's way. Raises: InputError when no pose has the front layer in view."""
     path = scenario.path
     if path.kind == "draws":
         T_dock_cam, surface_m = _draws(scenario, station, camera, rng)
         run, step = np.divmod(np.arange(path.count * path.hold), path.hold)
         stamps = draw_stamps(path).ravel()
-        return _Course(stamps, T_dock_cam.reshape(-1, 4, 4), run, step, run * path.hold, surface_m)
+        return Course(stamps, T_dock_cam.reshape(-1, 4, 4), run, step, run * path.hold, surface_m)
     t_ns, T_dock_cam = trajectory(scenario, rng)
     frames = np.arange(len(t_ns))
-    return _Course(t_ns, T_dock_cam, np.zeros_like(frames), frames, frames, np.array([np.inf]))
+    return Course(t_ns, T_dock_cam, np.zeros_like(frames), frames, frames, np.array([np.inf]))
 
 
 def _draws(scenario: Scenario, station: Station, camera: Camera, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -240,7 +241,7 @@ def _shining(axis: Array, scenario: Scenario, T_dock_cam: Array, p_dock: Array) 
     return np.asarray(((T_dock_cam[:, None, :3, 3] - p_dock) * axis).sum(axis=2) > 0.0)
 
 
-def _world(scenario: Scenario, station: Station, course: _Course, rng: np.random.Generator) -> _World:
+def world_of(scenario: Scenario, station: Station, course: Course, rng: np.random.Generator) -> World:
     """What the run's draws decide; without survey and calibration errors, what the station and the camera say."""
     g, m, spots = len(course.surface_m), len(station), scenario.spots
     off = rng.normal(size=(g, m, 3)) * station.sigma_light_m
@@ -249,11 +250,11 @@ def _world(scenario: Scenario, station: Station, course: _Course, rng: np.random
     front_m, rear_m = (rng.uniform(*reach, (g, 1)) for reach in (spots.front_range_m, spots.rear_range_m))
     lens = rng.normal(size=(g, 3)) * [station.sigma_focal, station.sigma_center_px, station.sigma_center_px]
     lens *= spots.calibration
-    return _World(
+    return World(
         p_dock=station.p_dock + off * spots.survey,
         reach_m=np.where(front, front_m, rear_m),
         dead=_some(np.ones((g, m), bool), rng.integers(*spots.dead, g, endpoint=True), rng),
-        focal=lens[:, 0],
+        focal=lens[:, 0] + scenario.lens.focal_error,
         center_px=lens[:, 1:],
         black=_black(spots.black_outs, course.t_ns * 1e-9, rng),
     )
@@ -276,7 +277,7 @@ def _black(knobs: BlackOuts, t_s: Array, rng: np.random.Generator) -> np.ndarray
 
 
 def _shown(
-    scenario: Scenario, station: Station, camera: Camera, course: _Course, world: _World
+    scenario: Scenario, station: Station, camera: Camera, course: Course, world: World
 ) -> tuple[Array, np.ndarray]:
     """True pixels (N, M, 2) of all lights, or of their mirror images, and which (N, M) can be seen."""
     p_dock = world.p_dock[course.run]
@@ -286,16 +287,28 @@ def _shown(
     uv = _through_lens(camera, course, world, uv)
     near = np.linalg.norm(p_cam, axis=2) < world.reach_m[course.run]
     shining = _shining(station.axis, scenario, course.T_dock_cam, p_dock)
-    return uv, camera.contains(uv) & shining & near & scenario.spots.dock
+    return uv, camera.contains(uv) & shining & near & shown_layers(scenario, station) & scenario.spots.dock
 
 
-def _through_lens(camera: Camera, course: _Course, world: _World, uv: Array) -> Array:
+def shown_layers(scenario: Scenario, station: Station) -> np.ndarray:
+    """Which lights (M,) belong to a layer that shines."""
+    front = station.layer == station.layers.index(station.layers_front_to_rear()[0])
+    return np.asarray({"all": np.ones_like(front), "front": front, "rear": ~front}[scenario.lamps.layers])
+
+
+def failed(scenario: Scenario, station: Station, t_s: Array) -> np.ndarray:
+    """Which lights (N, M) have failed by the times `t_s` (N,) since the start."""
+    end_s = np.array([scenario.lamps.failures.get(light, np.inf) for light in station.ids])
+    return np.asarray(t_s[:, None] >= end_s)
+
+
+def _through_lens(camera: Camera, course: Course, world: World, uv: Array) -> Array:
     """Pixels (N, M, 2) as the lens really makes them, of those that the calibration says."""
     scale = 1.0 + world.focal[course.run, None, None]
     return np.asarray((uv - camera.center_px) * scale + camera.center_px + world.center_px[course.run, None])
 
 
-def _unseen(scenario: Scenario, camera: Camera, course: _Course, world: _World, uv: Array) -> Array:
+def _unseen(scenario: Scenario, camera: Camera, course: Course, world: World, uv: Array) -> Array:
     """True pixels (N, M, 2) of a dock that is not seen; NaN when there is none."""
     if not scenario.spots.dock:
         return np.full_like(uv, np.nan)
@@ -305,8 +318,8 @@ def _unseen(scenario: Scenario, camera: Camera, course: _Course, world: _World, 
 def _dark(
     scenario: Scenario,
     station: Station,
-    course: _Course,
-    world: _World,
+    course: Course,
+    world: World,
     visible: np.ndarray,
     rng: np.random.Generator,
 ) -> np.ndarray:
@@ -315,7 +328,8 @@ def _dark(
     count = rng.integers(*scenario.faults.missing, len(visible), endpoint=True)
     missing = _some(visible & front, count, rng)[course.missing_from]
     dropped = rng.random(visible.shape) < scenario.spots.drop
-    return np.asarray(missing | dropped | world.dead[course.run] | world.black[:, None])
+    off = failed(scenario, station, course.t_ns * 1e-9)
+    return np.asarray(missing | dropped | world.dead[course.run] | world.black[:, None] | off)
 
 
 def _box(scenario: Scenario, camera: Camera, uv: Array, visible: np.ndarray) -> tuple[Array, Array]:
@@ -332,7 +346,7 @@ def _box(scenario: Scenario, camera: Camera, uv: Array, visible: np.ndarray) -> 
     return low, high
 
 
-def _wandering(scenario: Scenario, camera: Camera, course: _Course, rng: np.random.Generator) -> Array:
+def _wandering(scenario: Scenario, camera: Camera, course: Course, rng: np.random.Generator) -> Array:
     """Pixels (N, W, 2) of the spurious spots that wander through a run; in draws there are none."""
     if scenario.path.kind == "draws":
         return np.empty((len(course.t_ns), 0, 2))
@@ -340,7 +354,7 @@ def _wandering(scenario: Scenario, camera: Camera, course: _Course, rng: np.rand
 
 
 def _strays(
-    scenario: Scenario, world: _World, wander: Array, box: tuple[Array, Array], rng: np.random.Generator
+    scenario: Scenario, world: World, wander: Array, box: tuple[Array, Array], rng: np.random.Generator
 ) -> tuple[Indices, Array]:
     """Frame (S,) and pixels (S, 2) of all spurious spots: those that `wander` (N, W, 2), and those drawn anew."""
     n = len(wander)
@@ -374,7 +388,7 @@ def _p_rear(scenario: Scenario, station: Station, light: Indices, rng: np.random
     return np.where(rear, _P_REAR[1], _P_REAR[0]) if scenario.spots.color else np.full(len(light), np.nan)
 
 
-def _attitudes(scenario: Scenario, course: _Course, rng: np.random.Generator) -> list[Attitude | None]:
+def _attitudes(scenario: Scenario, course: Course, rng: np.random.Generator) -> list[Attitude | None]:
     """What the vehicle's own sensors say in each of the N frames."""
     knobs = scenario.spots.attitude
     if knobs is None:
@@ -385,14 +399,14 @@ def _attitudes(scenario: Scenario, course: _Course, rng: np.random.Generator) ->
     return [Attitude(R, sigma_rad) for R in rotations(w) @ course.T_dock_cam[:, :3, :3]]
 
 
-def _ends(course: _Course, spots: _Spots) -> list[int]:
+def _ends(course: Course, spots: _Spots) -> list[int]:
     """Where each frame's spots begin, and the last ones end: N + 1 places in the row."""
     ends: list[int] = np.searchsorted(spots.frame, np.arange(len(course.t_ns) + 1)).tolist()
     return ends
 
 
 def _detections(
-    course: _Course, spots: _Spots, uv: Array, p_rear: Array, attitudes: list[Attitude | None]
+    course: Course, spots: _Spots, uv: Array, p_rear: Array, attitudes: list[Attitude | None]
 ) -> Iterator[Detections]:
     """One frame's detections after the other; they are views of the arrays `uv` (S, 2) and `p_rear` (S,)."""
     unknown, sure, ends = np.full(len(uv), np.nan), np.ones(len(uv)), _ends(course, spots)

@@ -1,0 +1,204 @@
+"""What shines beside the dock's lamps: images in the water surface, glints, snow, another vehicle, light without a lamp."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lumidock.datatypes import Array
+from lumidock.geometry import se3_inverse, transform_points
+from lumidock.sim.canvas import Canvas
+from lumidock.sim.knobs import Glints, Headlamp, Snow, Surface, Vehicle
+from lumidock.sim.lens import Lens
+from lumidock.sim.optics import PHOTON_J, SPECTRUM, Emitters, emission_cosine, emitters, intensity
+from lumidock.sim.scattering import backscatter_share, phase_at
+from lumidock.sim.scenario import Scenario
+from lumidock.sim.water import absorption_scattering, diffuse_attenuation, phase_kind
+from lumidock.station import Station
+
+_SNOW_TILE_M = 8.0  # the same particles come again at this distance
+_FAR_M = 100.0
+_LAMP_STEPS = 28
+_FORWARD_RAD = np.deg2rad(30.0)  # daylight comes from a cone about this wide
+
+
+def mirrored(
+    knobs: Surface,
+    lens: Lens,
+    station: Station,
+    p_dock: Array,
+    watts: Array,
+    T_dock_cam: Array,
+    radius_m: float,
+    exposure_s: float,
+    t_s: float,
+    rng: np.random.Generator,
+    index: float,
+) -> list[Emitters]:
+    """Images of M lamps in a rough surface: a halo for each image, and a core for each of its fragments.
+
+    Every fragment is the image in a facet whose slope follows the waves. Source: mirror images by reflection at a plane;
+    Fresnel's law; slopes: C. Cox, W. Munk, J. Opt. Soc. Am. 44, 1954.
+    """
+    camera_m = T_dock_cam[:3, 3]
+    m, k = len(p_dock), knobs.fragments
+    period = knobs.period_s * rng.uniform(0.6, 1.6, (3, m, k))
+    wave = np.sin(2.0 * np.pi * t_s / period + rng.uniform(0.0, 2.0 * np.pi, (3, m, k)))
+    below, own = knobs.height_m - p_dock[:, 1], knobs.height_m - camera_m[1]
+    if own <= 0.0 or (below <= 0.0).any():
+        return []
+    at = p_dock + (camera_m - p_dock) * (below / (below + own))[:, None]
+    at[:, 1] = knobs.height_m
+    normal = np.stack(
+        [knobs.slope * np.sqrt(2.0) * wave[0], np.ones((m, k)), knobs.slope * np.sqrt(2.0) * wave[1]], axis=-1
+    )
+    normal[:, 0, [0, 2]] *= 0.3  # one facet is always near the mirror's own place
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    image = p_dock[:, None] + 2.0 * ((at - p_dock)[:, None] * normal).sum(axis=-1, keepdims=True) * normal
+    share = 0.05 + (1.0 + wave[2]) ** 2
+    share /= share.sum(axis=1, keepdims=True)
+    axis = station.axis * [1.0, -1.0, 1.0]
+    still = p_dock * [1.0, -1.0, 1.0] + [0.0, 2.0 * knobs.height_m, 0.0]
+    cosine = emission_cosine(still, axis, camera_m)
+    path_m = np.linalg.norm(still - camera_m, axis=1)
+    back = fresnel((below + own) / path_m, index)
+    watt_sr = (intensity(np.ones(m), station.beam_deg, cosine) * back)[:, None] * watts
+    T_cam_dock = se3_inverse(T_dock_cam)
+    cores = emitters(
+        "mirror",
+        lens,
+        transform_points(T_cam_dock, image.reshape(-1, 3)),
+        np.repeat(watt_sr, k, axis=0) * share.reshape(-1, 1),
+        radius_m,
+        exposure_s,
+        halo=0.0,
+    )
+    halos = emitters("mirror", lens, transform_points(T_cam_dock, still), watt_sr, radius_m, exposure_s, core=0.0)
+    return [cores, halos]
+
+
+def fresnel(cosine: Array, index: float) -> Array:
+    """Reflectance of the surface seen from below, unpolarised, at the `cosine` of the angle to the vertical."""
+    sine2 = (1.0 - cosine**2) * index**2
+    out = np.sqrt(np.maximum(1.0 - sine2, 0.0))
+    across = ((index * cosine - out) / (index * cosine + out)) ** 2
+    along = ((cosine - index * out) / (cosine + index * out)) ** 2
+    return np.asarray(np.where(sine2 >= 1.0, 1.0, 0.5 * (across + along)))
+
+
+def glints(
+    knobs: Glints,
+    lens: Lens,
+    station: Station,
+    p_dock: Array,
+    watts: Array,
+    T_dock_cam: Array,
+    exposure_s: float,
+    rng: np.random.Generator,
+) -> Emitters:
+    """Reflections on the tube beside each of M lamps, outward from the dock's axis."""
+    outward = p_dock * [1.0, 1.0, 0.0]
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    share = rng.uniform(*knobs.share, len(p_dock))
+    watt_sr = (share / (2.0 * np.pi) * (emission_cosine(p_dock, station.axis, T_dock_cam[:3, 3]) > 0.0))[
+        :, None
+    ] * watts
+    at = transform_points(se3_inverse(T_dock_cam), p_dock + knobs.offset_m * outward)
+    return emitters("glint", lens, at, watt_sr, 0.006, exposure_s, halo=0.0)
+
+
+def vehicle(knobs: Vehicle, lens: Lens, T_dock_cam: Array, radius_m: float, exposure_s: float, t_s: float) -> Emitters:
+    """Lamps of another vehicle, side by side, shining all around."""
+    side = (np.arange(knobs.lamps) - 0.5 * (knobs.lamps - 1)) * knobs.spacing_m
+    middle = np.array(knobs.start) + np.array(knobs.velocity_m_s) * t_s
+    at = middle + side[:, None] * [0.9, 0.15, 0.4]
+    watt_sr = np.tile(knobs.power_w / (4.0 * np.pi) * np.array(SPECTRUM[knobs.color]), (knobs.lamps, 1))
+    return emitters("vehicle", lens, transform_points(se3_inverse(T_dock_cam), at), watt_sr, radius_m, exposure_s)
+
+
+def snow(
+    knobs: Snow,
+    scenario: Scenario,
+    lens: Lens,
+    T_dock_cam: Array,
+    exposure_s: float,
+    t_s: float,
+    rng: np.random.Generator,
+) -> Emitters:
+    """Particles that keep their places while the camera moves through them, in the light of headlamp and day."""
+    count = int(knobs.per_m3 * _SNOW_TILE_M**3)
+    tile, share = rng.uniform(0.0, _SNOW_TILE_M, (count, 3)), rng.random(count)
+    low, high = (1e-3 * value for value in knobs.radius_mm)
+    radius = (low**-2.0 - share * (low**-2.0 - high**-2.0)) ** -0.5
+    camera_m = T_dock_cam[:3, 3]
+    p_dock = tile + np.array(knobs.drift_m_s) * t_s - camera_m
+    p_dock = (p_dock + 0.5 * _SNOW_TILE_M) % _SNOW_TILE_M - 0.5 * _SNOW_TILE_M
+    p_cam = p_dock @ T_dock_cam[:3, :3]
+    close = (
+        (p_cam[:, 2] > 0.15) & (p_cam[:, 2] < knobs.reach_m) & (np.abs(p_cam[:, :2]) < 1.2 * p_cam[:, 2:]).all(axis=1)
+    )
+    p_cam, radius = p_cam[close], radius[close]
+    light = daylight_w_m2(scenario, camera_m[1])[None] * np.ones((len(p_cam), 1))
+    if scenario.around.headlamp is not None:
+        light = light + headlamp_w_m2(scenario, scenario.around.headlamp, p_cam)
+    watt_sr = light * knobs.albedo * radius[:, None] ** 2  # a diffuse sphere's mean, A / pi of its cross section
+    return emitters("snow", lens, p_cam, watt_sr, radius, exposure_s, halo=0.0)
+
+
+def headlamp_w_m2(scenario: Scenario, knobs: Headlamp, p_cam: Array) -> Array:
+    """Irradiance (N, 3) of the vehicle's lamp at points `p_cam` (N, 3)."""
+    a, b = absorption_scattering(scenario.water)
+    way = p_cam - np.array(knobs.offset_m)
+    far = np.linalg.norm(way, axis=1)
+    watt_sr = intensity(np.array(knobs.power_w), knobs.beam_deg, way[:, 2] / far)
+    return np.asarray((watt_sr / far**2)[:, None] * np.array(SPECTRUM["white"]) * np.exp(-(a + b) * far[:, None]))
+
+
+def daylight_w_m2(scenario: Scenario, height_m: float) -> Array:
+    """Downward irradiance (3,) in each band, `height_m` above the dock's origin."""
+    a, b = absorption_scattering(scenario.water)
+    decay = diffuse_attenuation(a, b * backscatter_share(phase_kind(scenario.water)))
+    depth = max(scenario.daylight.depth_m - height_m, 0.0)
+    return np.asarray(scenario.daylight.surface_w_m2 * np.exp(-decay * depth))
+
+
+def daylight_sr(scenario: Scenario, R_dock_cam: Array, height_m: float, rays: Array) -> Array:
+    """Radiance (h, w, 3) W/(m2 sr) of the water along `rays` (h, w, 3), lit from above.
+
+    Single scattering of what comes down, integrated along the line of sight to the surface, times `daylight.more`.
+    """
+    a, b = absorption_scattering(scenario.water)
+    kind, knobs = phase_kind(scenario.water), scenario.daylight
+    decay = diffuse_attenuation(a, b * backscatter_share(kind))
+    up = (rays @ R_dock_cam.T)[..., 1]
+    depth = max(knobs.depth_m - height_m, 0.01)
+    length = np.where(up > 1e-3, np.minimum(depth / np.maximum(up, 1e-3), _FAR_M), _FAR_M)[..., None]
+    rate = (a + b) - decay * up[..., None]
+    rate = np.where(np.abs(rate) < 1e-6, 1e-6, rate)
+    angle = np.maximum(np.arccos(np.clip(up, -1.0, 1.0)), _FORWARD_RAD)
+    along = -np.expm1(-np.minimum(rate * length, 50.0)) / rate
+    return np.asarray(knobs.more * daylight_w_m2(scenario, height_m) * b * phase_at(kind, angle)[..., None] * along)
+
+
+def headlamp_sr(scenario: Scenario, knobs: Headlamp, rays: Array) -> Array:
+    """Radiance (h, w, 3) W/(m2 sr) of the water in the light of the vehicle's own lamp. Single scattering."""
+    a, b = absorption_scattering(scenario.water)
+    kind = phase_kind(scenario.water)
+    edges = np.concatenate([[0.0], np.logspace(-1.0, 1.3, _LAMP_STEPS)])
+    total = np.zeros(rays.shape)
+    for sight, step in zip(0.5 * (edges[1:] + edges[:-1]), np.diff(edges), strict=True):
+        p_cam = (rays * sight).reshape(-1, 3)
+        way = p_cam - np.array(knobs.offset_m)
+        cosine = -(way * rays.reshape(-1, 3)).sum(axis=1) / np.linalg.norm(way, axis=1)
+        beta = phase_at(kind, np.arccos(np.clip(cosine, -1.0, 1.0)))
+        light = headlamp_w_m2(scenario, knobs, p_cam) * b * np.exp(-(a + b) * sight)
+        total += (light * beta[:, None]).reshape(rays.shape) * step
+    return total
+
+
+def add_background(
+    canvas: Canvas, scenario: Scenario, T_dock_cam: Array, exposure_s: float, lamp_sr: Array | None
+) -> None:
+    """Add the water's own light: daylight and, from `lamp_sr` (h, w, 3), that of the vehicle's lamp."""
+    sr = daylight_sr(scenario, T_dock_cam[:3, :3], float(T_dock_cam[1, 3]), canvas.wide_rays)
+    sr = sr if lamp_sr is None else sr + lamp_sr
+    canvas.add_background(sr * (canvas.lens.aperture_m2 * exposure_s / PHOTON_J))

@@ -1,0 +1,309 @@
+"""From emitters and background to the electrons that each pixel of the mosaic is expected to collect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from lumidock.datatypes import Array
+from lumidock.sim.knobs import Output
+from lumidock.sim.lens import Lens
+from lumidock.sim.optics import Emitters
+from lumidock.sim.scattering import halo
+
+# quantum efficiency of the B, G, R pixels (rows) in the three bands (columns); IMX264, peaks .48, .57, .52
+_QE_COLOR = np.array([[0.48, 0.12, 0.02], [0.12, 0.57, 0.08], [0.03, 0.08, 0.52]])
+_QE_MONO = np.array([[0.60, 0.65, 0.55]])
+_MID, _WIDE = 4, 16  # strides of the coarse canvases
+_NEAR_PX, _FAR_PX = (
+    28.0,
+    170.0,
+)  # where a halo passes from the mosaic to the middle canvas, and from that to the wide one
+_FAINT_E = 0.02  # electrons per pixel below which a halo is not drawn
+_HALO_RINGS = 256
+_STEPS_PER_PX = 2.0  # of a smeared core
+
+
+@dataclass(frozen=True, slots=True)
+class Mosaic:
+    """Colours of the pixels: quantum efficiency `qe` (C, 3) by channel and band, period, and the channel at each site."""
+
+    qe: Array
+    step: int
+    sites: tuple[tuple[int, int, int], ...]  # channel, row, column
+
+    @classmethod
+    def of(cls, output: Output) -> Mosaic:
+        """The mosaic of a pattern, or of a sensor without colour."""
+        if not output.color:
+            return cls(_QE_MONO, 1, ((0, 0, 0),))
+        channels = ["bgr".index(letter) for letter in output.pattern]
+        return cls(_QE_COLOR, 2, tuple((c, i // 2, i % 2) for i, c in enumerate(channels)))
+
+
+@dataclass(eq=False)
+class Canvas:
+    """Collects light: sharp things on the `mosaic` (H, W), wide halos on two coarse canvases (h, w, C).
+
+    `absorption` and `scattering` (3,) and `phase` are the water's; `cores` keeps what was drawn sharply, by emitter.
+    """
+
+    lens: Lens
+    colors: Mosaic
+    absorption: Array
+    scattering: Array
+    phase: str
+    mosaic: Array = field(init=False)
+    mid: Array = field(init=False)
+    wide: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Empty it."""
+        camera, channels = self.lens.camera, len(self.colors.qe)
+        height, width = (-(-size // _WIDE) for size in (camera.height, camera.width))
+        self.wide = np.zeros((height, width, channels), np.float32)
+        self.mid = np.zeros((height * _WIDE // _MID, width * _WIDE // _MID, channels), np.float32)
+        self.mosaic = np.zeros((camera.height, camera.width), np.float32)
+
+    @cached_property
+    def wide_uv(self) -> Array:
+        """Pixels (h, w, 2) of the wide canvas's nodes."""
+        return _nodes(self.wide.shape, _WIDE)
+
+    @cached_property
+    def wide_rays(self) -> Array:
+        """Rays (h, w, 3) of the wide canvas's nodes."""
+        return self.lens.rays(self.wide_uv.reshape(-1, 2)).reshape(*self.wide.shape[:2], 3)
+
+    @cached_property
+    def wide_etendue(self) -> Array:
+        """Solid angle (h, w) sr of the pixels at the nodes, times what the lens lets through."""
+        uv = self.wide_uv.reshape(-1, 2)
+        return (self.lens.solid_angle(uv) * self.lens.throughput(uv)).reshape(self.wide.shape[:2])
+
+    def add_background(self, photons_sr: Array) -> None:
+        """Add an even radiance (h, w, 3): photons per sr that would enter the aperture in each band."""
+        self.wide += (photons_sr @ self.colors.qe.T * self.wide_etendue[:, :, None]).astype(np.float32)
+
+    def add(self, seen: Emitters, smear_px: Array) -> list[Core | None]:
+        """Draw all emitters; returns the core of each, None where it has none."""
+        cores: list[Core | None] = [None] * len(seen)
+        for i in np.flatnonzero(seen.lit):
+            direct = seen.at_lens[i] * np.exp(-(self.absorption + self.scattering) * seen.range_m[i])
+            if seen.core[i] > 0.0:
+                cores[i] = self._add_core(seen, int(i), self.colors.qe @ direct * seen.core[i], smear_px[i])
+            if seen.core[i] > 0.0 and self.lens.knobs.ghost > 0.0:
+                self._add_ghost(seen.uv[i], self.colors.qe @ direct * seen.core[i])
+            if seen.halo[i] > 0.0:
+                self._add_halo(seen, int(i), self.colors.qe @ direct)
+        return cores
+
+    def _add_core(self, seen: Emitters, i: int, electrons: Array, smear_px: Array) -> Core:
+        knobs = self.lens.knobs
+        window_px = float(seen.window_px[i])
+        reach = int(np.ceil(window_px + 5.0 * knobs.blur_px + 1.0 + 0.5 * float(np.hypot(*smear_px))))
+        rows, columns = _around(seen.uv[i], reach, self.mosaic.shape)
+        du, dv = (
+            np.arange(columns.start, columns.stop) - seen.uv[i, 0],
+            np.arange(rows.start, rows.stop) - seen.uv[i, 1],
+        )
+        shares = core_profile(du, dv, window_px, knobs.blur_px, smear_px)
+        patch = self._on_mosaic(
+            rows, columns, np.broadcast_to(electrons.astype(np.float32), (*shares.shape, len(electrons)))
+        )
+        patch *= shares * np.float32(1.0 - knobs.glare - knobs.ghost)
+        self.mosaic[rows, columns] += patch
+        return Core(rows, columns, patch)
+
+    def _add_ghost(self, uv: Array, electrons: Array) -> None:
+        """Add the light that comes back from the sensor and the lens once more, out of focus, mirrored at the centre."""
+        knobs = self.lens.knobs
+        per_px = knobs.ghost / (np.pi * knobs.ghost_px**2) * electrons
+        if per_px.max() < _FAINT_E:
+            return
+        node = (2.0 * self.lens.camera.center_px - uv + 0.5) / _MID - 0.5
+        radius = knobs.ghost_px / _MID
+        rows, columns = _around(node, int(radius) + 2, self.mid.shape)
+        du, dv = (np.arange(s.start, s.stop) - c for s, c in zip((columns, rows), node, strict=True))
+        disc = np.clip(radius - np.hypot(du[None, :], dv[:, None]) + 0.5, 0.0, 1.0)
+        self.mid[rows, columns] += (disc[:, :, None] * per_px).astype(np.float32)
+
+    def _on_mosaic(self, rows: slice, columns: slice, values: Array) -> Array:
+        """Of values (V, U, C) over a part of the picture, each pixel's own channel (V, U)."""
+        step, out = self.colors.step, np.empty(values.shape[:2], np.float32)
+        for channel, row, column in self.colors.sites:
+            at = np.s_[(row - rows.start) % step :: step, (column - columns.start) % step :: step]
+            out[at] = values[(*at, channel)]
+        return out
+
+    def _add_halo(self, seen: Emitters, i: int, direct_e: Array) -> None:
+        """Add the scattered light and the lens's glare, each radius on the canvas that is fine enough for it."""
+        J = self.lens.tangents(seen.uv[i : i + 1])[0]
+        focal_px = 1.0 / np.sqrt(np.linalg.norm(np.cross(J[:, 0], J[:, 1])))
+        profile = self._profile(seen, i, direct_e, focal_px)
+        near = _NEAR_PX + 2.0 * float(seen.window_px[i])
+        far = max(_FAR_PX, 3.0 * near)
+        uv = seen.uv[i]
+        rows, columns = _around(uv, int(near) + 1, self.mosaic.shape)
+        theta = _angles(J, np.arange(columns.start, columns.stop) - uv[0], np.arange(rows.start, rows.stop) - uv[1])
+        patch = profile.at(theta, 0.0, near / focal_px)
+        self.mosaic[rows, columns] += self._on_mosaic(rows, columns, patch)
+        reach = min(profile.reach_px, far)
+        if reach > 0.4 * near:
+            node = (uv + 0.5) / _MID - 0.5
+            rows, columns = _around(node, int(reach) // _MID + 1, self.mid.shape)
+            du, dv = (np.arange(s.start, s.stop) - c for s, c in zip((columns, rows), node, strict=True))
+            theta = _angles(J, du * _MID, dv * _MID)
+            self.mid[rows, columns] += profile.at(theta, near / focal_px, far / focal_px)
+        if profile.reach_px > 0.4 * far:
+            node = (uv + 0.5) / _WIDE - 0.5
+            rows, columns = _around(node, int(profile.reach_px) // _WIDE + 1, self.wide.shape)
+            apart = np.linalg.norm(self.wide_rays[rows, columns] - self.lens.rays(uv[None])[0], axis=2)
+            scale = self.wide_etendue[rows, columns] * (focal_px**2 / float(self.lens.throughput(uv[None])[0]))
+            light = profile.at(2.0 * np.arcsin(0.5 * apart), far / focal_px, np.inf)
+            self.wide[rows, columns] += light * scale[:, :, None].astype(np.float32)
+
+    def _profile(self, seen: Emitters, i: int, direct_e: Array, focal_px: float) -> Profile:
+        """Electrons per pixel of the halo against the angle, and how far it is worth drawing."""
+        knobs = self.lens.knobs
+        blur_rad = np.sqrt(knobs.blur_px**2 + seen.window_px[i] ** 2 / 4.0 + 1.0 / 12.0) / focal_px
+        blur_rad, range_m = (
+            float(f"{value:.3g}") for value in (blur_rad, seen.range_m[i])
+        )  # so that like ones are shared
+        bands = [
+            halo(float(a), float(b), self.phase, range_m, blur_rad)
+            for a, b in zip(self.absorption, self.scattering, strict=True)
+        ]
+        theta = bands[0][0]
+        scattered = np.stack([values for _, values in bands], axis=1) * seen.at_lens[i]
+        electrons = scattered @ self.colors.qe.T / focal_px**2
+        r0 = knobs.glare_px / focal_px
+        ring = np.gradient(np.pi * theta**2)
+        total = direct_e + (electrons * ring[:, None]).sum(axis=0) * focal_px**2
+        glare = knobs.glare / (2.0 * np.pi * knobs.glare_px**2) * (1.0 + (theta / r0) ** 2) ** -1.5
+        return Profile.of(theta, (electrons + glare[:, None] * total) * seen.halo[i], focal_px)
+
+    def expected(self) -> Array:
+        """Electrons (H, W) that are expected on the mosaic."""
+        step = self.colors.step
+        size = (self.mid.shape[1], self.mid.shape[0])
+        wide = cv2.resize(self.wide, size, interpolation=cv2.INTER_CUBIC).reshape(self.mid.shape)
+        smooth = np.maximum(self.mid + wide, 0.0)
+        for channel, row, column in self.colors.sites:
+            plane = self.mosaic[row::step, column::step]
+            scale, offset = step / _MID, ((row + 0.5) / _MID - 0.5, (column + 0.5) / _MID - 0.5)
+            to_node = np.array([[scale, 0.0, offset[1]], [0.0, scale, offset[0]]])
+            plane += cv2.warpAffine(
+                np.ascontiguousarray(smooth[:, :, channel]),
+                to_node,
+                (plane.shape[1], plane.shape[0]),
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
+        return self.mosaic
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Core:
+    """What one emitter adds sharply: electrons `patch` on `rows` and `columns` of the mosaic."""
+
+    rows: slice
+    columns: slice
+    patch: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Profile:
+    """A halo: electrons per pixel (R, C) at angles even in their logarithm, and its `reach_px`."""
+
+    first: float
+    per_ring: float
+    values: Array
+    reach_px: float
+
+    @classmethod
+    def of(cls, theta: Array, electrons: Array, focal_px: float) -> Profile:
+        """Resample; angles (A,) and electrons (A, C)."""
+        logs = np.linspace(np.log(0.2 / focal_px), np.log(theta[-1]), _HALO_RINGS)
+        values = np.stack([np.interp(logs, np.log(theta), column) for column in electrons.T], axis=1)
+        bright = np.flatnonzero(values.max(axis=1) > _FAINT_E)
+        reach = float(np.exp(logs[bright[-1]]) * focal_px) if len(bright) else 0.0
+        return cls(float(logs[0]), float(1.0 / (logs[1] - logs[0])), values.astype(np.float32), reach)
+
+    def at(self, theta: Array, inner: float, outer: float) -> Array:
+        """Electrons (..., C) at angles, faded in at `inner` and out at `outer` so that the canvases add up to one."""
+        place = np.clip((np.log(np.maximum(theta, 1e-12)) - self.first) * self.per_ring, 0.0, _HALO_RINGS - 1.001)
+        ring = place.astype(np.int64)
+        part = (place - ring).astype(np.float32)[..., None]
+        weight = _fade(theta, outer) - (_fade(theta, inner) if inner > 0.0 else 0.0)
+        values = self.values[ring] * (1.0 - part) + self.values[ring + 1] * part
+        return np.asarray(values * np.broadcast_to(np.asarray(weight, np.float32), theta.shape)[..., None])
+
+
+def _fade(theta: Array, end: float) -> Array | float:
+    """One up to 0.4 of `end`, zero from `end` on, smooth between."""
+    if np.isinf(end):
+        return 1.0
+    x = np.clip((theta / end - 0.4) / 0.6, 0.0, 1.0)
+    return np.asarray(1.0 - x * x * x * (10.0 - 15.0 * x + 6.0 * x * x))
+
+
+def _nodes(shape: tuple[int, ...], stride: int) -> Array:
+    u, v = (np.arange(n) * stride + 0.5 * (stride - 1) for n in (shape[1], shape[0]))
+    return np.stack(np.meshgrid(u, v), axis=-1)
+
+
+def _around(at: Array, reach: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns within `reach` of a place (2,) u, v on a canvas."""
+    u, v = int(np.floor(at[0])), int(np.floor(at[1]))
+    return (
+        slice(max(v - reach, 0), max(min(v + reach + 2, shape[0]), 0)),
+        slice(max(u - reach, 0), max(min(u + reach + 2, shape[1]), 0)),
+    )
+
+
+def _angles(J_ray_uv: Array, du: Array, dv: Array) -> Array:
+    """Angles (V, U) from the emitter of pixels at offsets `du` (U,), `dv` (V,)."""
+    (uu, uv_), (_, vv) = J_ray_uv.T @ J_ray_uv
+    return np.asarray(np.sqrt(uu * du[None, :] ** 2 + 2.0 * uv_ * du[None, :] * dv[:, None] + vv * dv[:, None] ** 2))
+
+
+def core_profile(du: Array, dv: Array, window_px: float, blur_px: float, smear_px: Array | None = None) -> Array:
+    """Share (V, U) of a lamp's direct light on each pixel: a uniform disc, smeared, blurred, summed over pixels.
+
+    The disc is a sum of Gaussians on a sunflower of points, so that the centre is exact at any radius.
+    """
+    count = min(max(1, int(4.0 * (window_px / blur_px) ** 2)), 4000)
+    k = np.arange(count) + 0.5
+    r, angle = window_px * np.sqrt(k / count), k * np.pi * (3.0 - np.sqrt(5.0))
+    x, y = r * np.cos(angle), r * np.sin(angle)
+    x, y = x - x.mean(), y - y.mean()
+    if smear_px is not None and float(np.hypot(*smear_px)) > 0.1:
+        steps = int(np.ceil(_STEPS_PER_PX * float(np.hypot(*smear_px)))) + 1
+        along = (np.arange(steps) + 0.5) / steps - 0.5
+        x, y = ((c[:, None] + s * along[None, :]).ravel() for c, s in zip((x, y), smear_px, strict=True))
+    columns = _pixel_integral(du[:, None] - x, blur_px)
+    rows = _pixel_integral(dv[:, None] - y, blur_px)
+    return np.asarray((rows @ columns.T) / len(x), np.float32)
+
+
+def _pixel_integral(offset: Array, sigma: float) -> Array:
+    """Integral over one pixel of a unit Gaussian centred `offset` px away."""
+    scaled = np.float32(1.0 / sigma) * np.asarray(offset, np.float32)
+    half = np.float32(0.5 / sigma)
+    return _normal_cdf(scaled + half) - _normal_cdf(scaled - half)
+
+
+def _normal_cdf(x: Array) -> Array:
+    """Normal distribution function to 1e-7. Source: Abramowitz & Stegun 7.1.26."""
+    z = np.abs(x) * np.float32(0.70710678)
+    t = 1.0 / (1.0 + np.float32(0.3275911) * z)
+    poly = t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))))
+    erf = 1.0 - poly * np.exp(-z * z)
+    return np.asarray(0.5 * (1.0 + np.where(x < 0, -erf, erf)))

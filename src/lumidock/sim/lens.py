@@ -1,0 +1,121 @@
+"""What the lens does with a direction: projection, flat port, solid angle of a pixel, light lost on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from lumidock.camera import Camera
+from lumidock.datatypes import Array
+from lumidock.sim.knobs import Lens as LensKnobs
+from lumidock.sim.knobs import Port
+
+_NEWTON_STEPS = 30
+_FIT_GRID = 15
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """The real lens: `camera` as it projects without a port, `port` before it, refractive `index` of the water."""
+
+    knobs: LensKnobs
+    camera: Camera
+    index: float
+
+    @classmethod
+    def of(
+        cls, knobs: LensKnobs, camera: Camera, index: float, focal: float = 0.0, center_px: Array | None = None
+    ) -> Lens:
+        """The lens behind a `camera` that was calibrated in water, with its errors.
+
+        `focal` is a relative error beside the knob's, `center_px` (2,) where the principal point is off. Behind a port
+        the lens is one that has this focal length in water on its axis.
+        """
+        K = camera.K.copy()
+        K[[0, 1], [0, 1]] *= (1.0 + knobs.focal_error + focal) / (index if knobs.port else 1.0)
+        K[:2, 2] += np.zeros(2) if center_px is None else center_px
+        return cls(knobs, replace(camera, K=K), index)
+
+    def project(self, p_cam: Array) -> Array:
+        """Pixels (N, 2) of points `p_cam` (N, 3) m in the water; NaN where the lens does not see them."""
+        if self.knobs.port is None:
+            return self.camera.project(p_cam)
+        return self.camera.project(_bent_by_port(self.knobs.port, self.index, p_cam))
+
+    def rays(self, uv: Array) -> Array:
+        """Unit directions `ray_cam` (N, 3) in the water from which pixels `uv` (N, 2) get their light."""
+        ray = self.camera.unproject(uv)
+        if self.knobs.port is None:
+            return ray
+        across = ray[:, :2] / self.index  # Snell's law: the glass, being flat, leaves no trace in the angle
+        return np.column_stack([across, np.sqrt(1.0 - (across * across).sum(axis=1))])
+
+    def tangents(self, uv: Array) -> Array:
+        """Change of the rays with the pixel, J_ray_uv (N, 3, 2) 1/px."""
+        step = 0.5 * np.eye(2)
+        return np.stack([self.rays(uv + move) - self.rays(uv - move) for move in step], axis=2)
+
+    def solid_angle(self, uv: Array) -> Array:
+        """Solid angle (N,) sr in the water of pixels `uv` (N, 2)."""
+        J = self.tangents(uv)
+        return np.asarray(np.linalg.norm(np.cross(J[:, :, 0], J[:, :, 1]), axis=1))
+
+    def throughput(self, uv: Array) -> Array:
+        """Share (N,) of the light on the axis that reaches pixels `uv` (N, 2): cosine of the aperture, vignetting."""
+        across = np.linalg.norm(uv - self.camera.center_px, axis=1) / self._corner_px
+        return np.asarray(self.camera.unproject(uv)[:, 2] * (1.0 - self.knobs.falloff * np.minimum(across, 1.2) ** 2))
+
+    @cached_property
+    def _corner_px(self) -> float:
+        return float(np.hypot(self.camera.width, self.camera.height)) / 2.0
+
+    @cached_property
+    def aperture_m2(self) -> float:
+        """Area of the entrance pupil."""
+        return float(np.pi * (self.knobs.focal_m / self.knobs.f_number / 2.0) ** 2)
+
+
+def _bent_by_port(port: Port, index: float, p_cam: Array) -> Array:
+    """Directions (N, 3) in air, before the lens, of light from points `p_cam` (N, 3) in the water behind the port.
+
+    Exact: the sine s of the angle in air solves gap tan + glass tan + rest tan = distance from the axis.
+    Source: A. Agrawal et al., CVPR 2012, for a port across the axis.
+    """
+    r, rest = np.hypot(p_cam[:, 0], p_cam[:, 1]), p_cam[:, 2] - port.gap_m - port.glass_m
+    layers = ((port.gap_m, 1.0), (port.glass_m, port.glass_index), (rest, index))
+    s = np.clip(index * r / np.hypot(r, np.maximum(p_cam[:, 2], 1e-9)), 0.0, 0.999)
+    low, high = np.zeros_like(s), np.ones_like(s)
+    for _ in range(_NEWTON_STEPS):
+        reach = sum(d * s / np.sqrt(n * n - s * s) for d, n in layers)
+        slope = sum(d * n * n / (n * n - s * s) ** 1.5 for d, n in layers)
+        low, high = np.where(reach < r, s, low), np.where(reach < r, high, s)
+        step = s - (reach - r) / slope
+        s = np.where((step > low) & (step < high), step, 0.5 * (low + high))
+    direction = p_cam[:, :2] / np.maximum(r, 1e-12)[:, None]
+    bent = np.column_stack([direction * s[:, None], np.sqrt(1.0 - s * s)])
+    bent[~(rest > 0.0)] = np.nan
+    return bent
+
+
+def calibrated_in_water(lens: Lens, camera: Camera) -> Camera:
+    """The plumb_bob calibration that boards in the water would give a lens behind a flat port.
+
+    Least squares over a grid of points across the picture at the distances of the knob; what is left is what no such
+    calibration can hold, since a port has no single viewpoint.
+    """
+    port = lens.knobs.port
+    if port is None:
+        return camera
+    u, v = (np.linspace(0.0, size - 1.0, _FIT_GRID) for size in (camera.width, camera.height))
+    rays = lens.rays(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
+    p_cam = np.concatenate([rays * (z / rays[:, 2:]) for z in np.linspace(*port.calibrated_at_m, 5)])
+    xy, uv = p_cam[:, :2] / p_cam[:, 2:], lens.project(p_cam) - lens.camera.center_px
+    r2 = (xy * xy).sum(axis=1)
+    columns = [(xy * r2[:, None] ** power).ravel() for power in range(4)]
+    f, *rest = np.linalg.lstsq(np.stack(columns, axis=1), uv.ravel(), rcond=None)[0]
+    K = lens.camera.K.copy()
+    K[0, 0] = K[1, 1] = f
+    k1, k2, k3 = (value / f for value in rest)
+    return Camera(camera.width, camera.height, K, "plumb_bob", np.array([k1, k2, 0.0, 0.0, k3]))
