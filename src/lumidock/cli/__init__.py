@@ -199,7 +199,13 @@ def _sim(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY.SUBKEY=VALUE", help="May be repeated.")
     ] = None,
-    detections: Annotated[bool, typer.Option("--detections", help="Bare detections, without rendering.")] = False,
+    detections: Annotated[
+        bool, typer.Option("--detections", help="Bare detections, without rendering: path, faults and spots alone count.")
+    ] = False,
+    video: Annotated[bool, typer.Option("--video", help="Pictures as video.mp4 instead of frames/.")] = False,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Processes; without it one for each core.")
+    ] = None,
     station: StationOption = None,
     camera: CameraOption = None,
     force: Force = False,
@@ -208,6 +214,8 @@ def _sim(
     from lumidock.sim.scenario import load_scenario
     from lumidock.sim.sequence import write_detections, write_rendered
 
+    if video and detections:
+        raise InputError("--video: bare detections have no pictures")
     loaded = load_scenario(scenario, tuple(settings or ()))
     station_file = shipped_or_path("station", station or DEFAULT_STATION)
     dock = load_station(station_file)
@@ -218,7 +226,7 @@ def _sim(
         frames = write_detections(loaded, dock, lens, seed, out)
     else:
         with progress_bar("sim") as progress:
-            frames = write_rendered(loaded, dock, lens, seed, out, progress=progress)
+            frames = write_rendered(loaded, dock, lens, seed, out, video=video, workers=workers, progress=progress)
     print(f"{frames} frames written to {out}")
 
 

@@ -101,7 +101,7 @@ class Canvas:
             if seen.core[i] > 0.0 and self.lens.knobs.ghost > 0.0:
                 self._add_ghost(seen.uv[i], self.colors.qe @ direct * seen.core[i])
             if seen.halo[i] > 0.0:
-                self._add_halo(seen, int(i), self.colors.qe @ direct)
+                self._add_halo(seen, int(i), self.colors.qe @ direct, cores[i])
         return cores
 
     def _add_core(self, seen: Emitters, i: int, electrons: Array, smear_px: Array) -> Core:
@@ -142,7 +142,7 @@ class Canvas:
             out[at] = values[(*at, channel)]
         return out
 
-    def _add_halo(self, seen: Emitters, i: int, direct_e: Array) -> None:
+    def _add_halo(self, seen: Emitters, i: int, direct_e: Array, core: Core | None) -> None:
         """Add the scattered light and the lens's glare, each radius on the canvas that is fine enough for it."""
         J = self.lens.tangents(seen.uv[i : i + 1])[0]
         focal_px = 1.0 / np.sqrt(np.linalg.norm(np.cross(J[:, 0], J[:, 1])))
@@ -150,6 +150,8 @@ class Canvas:
         near = _NEAR_PX + 2.0 * float(seen.window_px[i])
         far = max(_FAR_PX, 3.0 * near)
         uv = seen.uv[i]
+        if core is not None and core.own.size:
+            core.own[...] += self._peak(profile, J, uv, core)
         rows, columns = _around(uv, int(near) + 1, self.mosaic.shape)
         theta = _angles(J, np.arange(columns.start, columns.stop) - uv[0], np.arange(rows.start, rows.stop) - uv[1])
         patch = profile.at(theta, 0.0, near / focal_px)
@@ -168,6 +170,13 @@ class Canvas:
             scale = self.wide_etendue[rows, columns] * (focal_px**2 / float(self.lens.throughput(uv[None])[0]))
             light = profile.at(2.0 * np.arcsin(0.5 * apart), far / focal_px, np.inf)
             self.wide[rows, columns] += light * scale[:, :, None].astype(np.float32)
+
+    def _peak(self, profile: Profile, J_ray_uv: Array, uv: Array, core: Core) -> Array:
+        """What the halo adds on the pixels of its core, over what it adds at their border."""
+        across, down = (np.arange(s.start, s.stop) - c for s, c in zip((core.columns, core.rows), uv, strict=True))
+        theta = _angles(J_ray_uv, across, down)
+        border = profile.at(theta.max(keepdims=True), 0.0, np.inf)
+        return self._on_mosaic(core.rows, core.columns, profile.at(theta, 0.0, np.inf) - border)
 
     def _profile(self, seen: Emitters, i: int, direct_e: Array, focal_px: float) -> Profile:
         """Electrons per pixel of the halo against the angle, and how far it is worth drawing."""
@@ -211,11 +220,11 @@ class Canvas:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Core:
-    """What one emitter adds sharply: electrons `patch` on `rows` and `columns` of the mosaic."""
+    """The spot of one emitter: electrons `own` on `rows` and `columns` of the mosaic, direct and by the halo's peak."""
 
     rows: slice
     columns: slice
-    patch: Array
+    own: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -279,7 +288,7 @@ def core_profile(du: Array, dv: Array, window_px: float, blur_px: float, smear_p
 
     The disc is a sum of Gaussians on a sunflower of points, so that the centre is exact at any radius.
     """
-    count = min(max(1, int(4.0 * (window_px / blur_px) ** 2)), 4000)
+    count = min(max(1, int(2.0 * (window_px / blur_px) ** 2)), 4000)
     k = np.arange(count) + 0.5
     r, angle = window_px * np.sqrt(k / count), k * np.pi * (3.0 - np.sqrt(5.0))
     x, y = r * np.cos(angle), r * np.sin(angle)

@@ -131,17 +131,18 @@ class Studio:
         return np.where(still[:, None], 0.0, np.clip(smear, -200.0, 200.0))
 
     def _snr(self, electrons: Array, core: Core | None) -> float:
-        """Signal-to-noise ratio of one core for a filter of its own shape, against all else that is in the picture.
+        """Signal-to-noise ratio of one spot for a filter of its own shape, against all else that is in the picture.
 
-        Shot noise of ambient light, back-scatter and every halo, read noise, rounding; what saturates tells nothing.
-        Source: D. North, RCA Report PTR-6C, 1943.
+        Shot noise of ambient light, back-scatter and every halo, read noise, rounding; where all is saturated, the spot
+        does not show. Source: D. North, RCA Report PTR-6C, 1943.
         """
-        if core is None or not core.patch.size:
+        if core is None or not core.own.size:
             return 0.0
         sensor, full = self.scenario.sensor, saturation_e(self.scenario.sensor)
-        rest = electrons[core.rows, core.columns] - core.patch
-        signal = np.minimum(rest + core.patch, full) - np.minimum(rest, full)
-        variance = np.maximum(rest, 0.0) + sensor.read_noise_e**2 + electrons_per_level(sensor) ** 2 / 12.0
+        total = electrons[core.rows, core.columns]
+        rest = np.maximum(total - core.own, 0.0)
+        signal = np.minimum(total, full) - np.minimum(rest, full)
+        variance = rest + sensor.read_noise_e**2 + electrons_per_level(sensor) ** 2 / 12.0
         return float(np.sqrt((signal * signal / variance).sum(dtype=np.float64)))
 
     def _occlude(self, moment: Moment, electrons: Array, cores: list[Core | None]) -> None:
@@ -166,7 +167,7 @@ class Studio:
             electrons[row::step, column::step] += np.float32(body[channel]) * (1.0 - clear[row::step, column::step])
         for core in cores:
             if core is not None:
-                core.patch[...] *= clear[core.rows, core.columns]
+                core.own[...] *= clear[core.rows, core.columns]
 
 
 def _strays(own: Emitters, uv: Array) -> Emitters:

@@ -30,7 +30,8 @@ _IOP: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] =
     "pool-clear": ((0.0105, 0.0445, 0.264), (0.058, 0.050, 0.043)),
     "pool-murky": ((0.0500, 0.0650, 0.275), (0.580, 0.500, 0.430)),
 }
-_PHASE = {"pure-sea": "clear", "IB": "clear", "II": "clear", "III": "coastal", "1C": "coastal", "pool-clear": "coastal"}
+# Petzold's water that scatters like it; harbour, nearest to the mean over particles with which the tables were derived
+_PHASE = {"pure-sea": "clear"}
 # change of a per psu and per kelvin. Source: J. Sullivan et al., Applied Optics 45, 2006, as tabulated by R. Roettgers, WOPP 3
 _A_PER_PSU, _A_PER_KELVIN = np.array([0.0, 1.4e-5, 3.5e-5]), np.array([0.0, 1.8e-5, 9.2e-4])
 _A_TABLE_PSU, _A_TABLE_C = 35.0, 20.0  # at which the table holds
