@@ -200,7 +200,8 @@ def _sim(
         list[str] | None, typer.Option("--set", metavar="KEY.SUBKEY=VALUE", help="May be repeated.")
     ] = None,
     detections: Annotated[
-        bool, typer.Option("--detections", help="Bare detections, without rendering: path, faults and spots alone count.")
+        bool,
+        typer.Option("--detections", help="Bare detections, without rendering: path, faults and spots alone count."),
     ] = False,
     video: Annotated[bool, typer.Option("--video", help="Pictures as video.mp4 instead of frames/.")] = False,
     workers: Annotated[

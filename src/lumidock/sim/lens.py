@@ -13,16 +13,21 @@ from lumidock.sim.knobs import Lens as LensKnobs
 from lumidock.sim.knobs import Port
 
 _NEWTON_STEPS = 30
-_FIT_GRID = 15
+_FIT_GRID, _FIT_STEPS = 15, 8
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """The real lens: `camera` as it projects without a port, `port` before it, refractive `index` of the water."""
+    """The real lens: `camera` as it projects without a port, `port` before it, refractive `index` of the water.
+
+    Behind a port `viewpoint_m` is how far before the entrance pupil the origin of `cam` lies: where a calibration in water
+    sees the light come together.
+    """
 
     knobs: LensKnobs
     camera: Camera
     index: float
+    viewpoint_m: float = 0.0
 
     @classmethod
     def of(
@@ -36,13 +41,14 @@ class Lens:
         K = camera.K.copy()
         K[[0, 1], [0, 1]] *= (1.0 + knobs.focal_error + focal) / (index if knobs.port else 1.0)
         K[:2, 2] += np.zeros(2) if center_px is None else center_px
-        return cls(knobs, replace(camera, K=K), index)
+        lens = cls(knobs, replace(camera, K=K), index)
+        return lens if knobs.port is None else replace(lens, viewpoint_m=_fit_in_water(lens, knobs.port)[0])
 
     def project(self, p_cam: Array) -> Array:
         """Pixels (N, 2) of points `p_cam` (N, 3) m in the water; NaN where the lens does not see them."""
         if self.knobs.port is None:
             return self.camera.project(p_cam)
-        return self.camera.project(_bent_by_port(self.knobs.port, self.index, p_cam))
+        return self.camera.project(_bent_by_port(self.knobs.port, self.index, p_cam + [0.0, 0.0, self.viewpoint_m]))
 
     def rays(self, uv: Array) -> Array:
         """Unit directions `ray_cam` (N, 3) in the water from which pixels `uv` (N, 2) get their light."""
@@ -92,7 +98,7 @@ def _bent_by_port(port: Port, index: float, p_cam: Array) -> Array:
         slope = sum(d * n * n / (n * n - s * s) ** 1.5 for d, n in layers)
         low, high = np.where(reach < r, s, low), np.where(reach < r, high, s)
         step = s - (reach - r) / slope
-        s = np.where((step > low) & (step < high), step, 0.5 * (low + high))
+        s = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
     direction = p_cam[:, :2] / np.maximum(r, 1e-12)[:, None]
     bent = np.column_stack([direction * s[:, None], np.sqrt(1.0 - s * s)])
     bent[~(rest > 0.0)] = np.nan
@@ -100,22 +106,32 @@ def _bent_by_port(port: Port, index: float, p_cam: Array) -> Array:
 
 
 def calibrated_in_water(lens: Lens, camera: Camera) -> Camera:
-    """The plumb_bob calibration that boards in the water would give a lens behind a flat port.
-
-    Least squares over a grid of points across the picture at the distances of the knob; what is left is what no such
-    calibration can hold, since a port has no single viewpoint.
-    """
-    port = lens.knobs.port
-    if port is None:
+    """What camera.yaml says: the `camera`, or the plumb_bob calibration that boards in water give behind a port."""
+    if lens.knobs.port is None:
         return camera
-    u, v = (np.linspace(0.0, size - 1.0, _FIT_GRID) for size in (camera.width, camera.height))
-    rays = lens.rays(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
-    p_cam = np.concatenate([rays * (z / rays[:, 2:]) for z in np.linspace(*port.calibrated_at_m, 5)])
-    xy, uv = p_cam[:, :2] / p_cam[:, 2:], lens.project(p_cam) - lens.camera.center_px
-    r2 = (xy * xy).sum(axis=1)
-    columns = [(xy * r2[:, None] ** power).ravel() for power in range(4)]
-    f, *rest = np.linalg.lstsq(np.stack(columns, axis=1), uv.ravel(), rcond=None)[0]
+    _, f, k1, k2, k3 = _fit_in_water(lens, lens.knobs.port)
     K = lens.camera.K.copy()
     K[0, 0] = K[1, 1] = f
-    k1, k2, k3 = (value / f for value in rest)
     return Camera(camera.width, camera.height, K, "plumb_bob", np.array([k1, k2, 0.0, 0.0, k3]))
+
+
+def _fit_in_water(lens: Lens, port: Port) -> Array:
+    """Viewpoint m, focal length px and k1, k2, k3 (5,) that fit a port best, over the picture and the knob's distances.
+
+    Gauss-Newton. What is left is what no such calibration can hold, as a port has no single viewpoint.
+    """
+    camera = lens.camera
+    u, v = (np.linspace(0.0, size - 1.0, _FIT_GRID) for size in (camera.width, camera.height))
+    rays = lens.rays(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
+    p = np.concatenate([rays * (z / rays[:, 2:]) for z in np.linspace(*port.calibrated_at_m, 5)])
+    uv = camera.project(_bent_by_port(port, lens.index, p)) - camera.center_px
+    viewpoint = 0.0
+    for _ in range(_FIT_STEPS):
+        xy = p[:, :2] / (p[:, 2:] - viewpoint)
+        r2 = (xy * xy).sum(axis=1, keepdims=True)
+        columns = np.stack([(xy * r2**power).ravel() for power in range(4)], axis=1)
+        terms = np.linalg.lstsq(columns, uv.ravel(), rcond=None)[0]
+        slope = sum((2 * power + 1) * terms[power] * r2**power for power in range(4)) * xy / (p[:, 2:] - viewpoint)
+        terms = np.linalg.lstsq(np.column_stack([columns, slope.ravel()]), uv.ravel(), rcond=None)[0]
+        viewpoint += terms[4]
+    return np.array([viewpoint, terms[0], *(terms[1:4] / terms[0])])
