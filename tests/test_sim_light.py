@@ -46,34 +46,41 @@ def drawn(seen, absorption, scattering, phase="harbour", output=MONO, lens=None)
 
 
 @numba.njit
-def fly(photons, a, b, radius, cdf, angle, edges, seed):
-    """Light that leaves a sphere around an isotropic lamp: unscattered, and by angle to the radius, per projected area."""
-    np.random.seed(seed)
+def fly(photons, a, b, radius, cdf, angle, edges, rng):
+    """Light leaving a sphere around an isotropic lamp: unscattered, and by angle to the radius, per flat area."""
     rings, direct = np.zeros(len(edges) - 1), 0.0
     for _ in range(photons):
-        p, d, weight, scattered = np.zeros(3), np.array([0.0, 0.0, 1.0]), 1.0, False
-        while weight > 1e-4 and p @ p < 4.0 * radius * radius:
-            step = -np.log(np.random.random()) / b if b > 0.0 else 1e9
-            along = p @ d
-            root = along * along - p @ p + radius * radius
+        x, y, z, dx, dy, dz, weight, scattered = 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, False
+        while weight > 1e-4 and x * x + y * y + z * z < 4.0 * radius * radius:
+            step = -np.log(rng.random()) / b
+            along = x * dx + y * dy + z * dz
+            root = along * along - (x * x + y * y + z * z) + radius * radius
             out = np.sqrt(root) - along if root > 0.0 else -1.0
             if 1e-9 < out <= step:
-                cosine = min((p + out * d) @ d / radius, 1.0)
+                cosine = min((along + out) / radius, 1.0)
                 light = weight * np.exp(-a * out)
                 if not scattered:
                     direct += light
-                else:
+                elif cosine > 0.0:
                     ring = np.searchsorted(edges, np.arccos(cosine)) - 1
-                    if ring < len(rings) and cosine > 0.0:
-                        rings[ring] += light / cosine
-            p = p + step * d
+                    if ring < len(rings):
+                        rings[max(ring, 0)] += light / cosine
+            x, y, z = x + step * dx, y + step * dy, z + step * dz
             weight, scattered = weight * np.exp(-a * step), True
-            bend, turn = np.interp(np.random.random(), cdf, angle), 2.0 * np.pi * np.random.random()
-            side = np.array([0.0, d[2], -d[1]]) if abs(d[0]) < 0.7 else np.array([-d[2], 0.0, d[0]])
-            side /= np.sqrt(side @ side)
-            up = np.cross(d, side)
-            d = np.cos(bend) * d + np.sin(bend) * (np.cos(turn) * side + np.sin(turn) * up)
-            d /= np.sqrt(d @ d)
+            bend, turn = np.interp(rng.random(), cdf, angle), 2.0 * np.pi * rng.random()
+            # two unit vectors across the way, by Gram-Schmidt from the axis that is farther from it
+            ex, ey = (1.0, 0.0) if abs(dx) < 0.7 else (0.0, 1.0)
+            dot = ex * dx + ey * dy
+            sx, sy, sz = ex - dot * dx, ey - dot * dy, -dot * dz
+            norm = np.sqrt(sx * sx + sy * sy + sz * sz)
+            sx, sy, sz = sx / norm, sy / norm, sz / norm
+            tx, ty, tz = dy * sz - dz * sy, dz * sx - dx * sz, dx * sy - dy * sx
+            c, s, cc, ss = np.cos(turn), np.sin(turn), np.cos(bend), np.sin(bend)
+            dx, dy, dz = (
+                cc * dx + ss * (c * sx + s * tx),
+                cc * dy + ss * (c * sy + s * ty),
+                cc * dz + ss * (c * sz + s * tz),
+            )
     return direct / photons, rings / photons
 
 
@@ -81,7 +88,7 @@ def flown(a, b, distance_m, kind, edges_rad, photons=400_000, seed=1):
     angle, beta = phase_function(kind)
     density = 2.0 * np.pi * beta * np.sin(angle)
     cdf = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(angle))])
-    return fly(photons, a, b, distance_m, cdf / cdf[-1], angle, edges_rad, seed)
+    return fly(photons, a, b, distance_m, cdf / cdf[-1], angle, edges_rad, np.random.default_rng(seed))
 
 
 EDGES_DEG = np.array([0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0])
@@ -334,7 +341,7 @@ def test_a_moving_lamp_is_drawn_along_its_way():
 
 @pytest.mark.parametrize("gain_db", [0.0, 6.0])
 def test_noise_follows_the_photon_transfer_curve(gain_db):
-    """Variance over mean is one level per electron's worth; the intercept is read noise and rounding. Source: EMVA 1288."""
+    """Variance over mean is levels per electron; what is left is read noise and rounding. Source: EMVA 1288."""
     settings = knobs.Sensor(gain_db=gain_db)
     per_level = 10700.0 / 4095.0 / 10 ** (gain_db / 20.0)
     means, variances = [], []

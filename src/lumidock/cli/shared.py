@@ -36,8 +36,15 @@ app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
 SIM = "sim:"
 DEFAULT_STATION, DEFAULT_CAMERA = "cage-2x2x5", "imx264-60deg"
-_SIMULATED = ("frames", "video.mp4", "detections.csv", "timestamps.csv", "lights_truth.csv", "spurious_truth.csv")
-_SIMULATED += ("stream_truth.csv",)
+_SIMULATED = (
+    "frames",
+    "video.mp4",
+    "detections.csv",
+    "timestamps.csv",
+    "lights_truth.csv",
+    "spurious_truth.csv",
+    "stream_truth.csv",
+)
 
 SCENARIOS = ", ".join(sorted(Path(entry.name).stem for entry in (files("lumidock") / "sim" / "scenarios").iterdir()))
 

@@ -1,4 +1,4 @@
-"""What shines beside the dock's lamps: images in the water surface, glints, snow, another vehicle, light without a lamp."""
+"""What shines beside the dock's lamps: their images in the surface, glints, snow, other lamps, the water itself."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def mirrored(
 ) -> list[Emitters]:
     """Images of M lamps in a rough surface: a halo for each image, and a core for each of its fragments.
 
-    Every fragment is the image in a facet whose slope follows the waves. Source: mirror images by reflection at a plane;
-    Fresnel's law; slopes: C. Cox, W. Munk, J. Opt. Soc. Am. 44, 1954.
+    Every fragment is the image in a facet whose slope follows the waves. Source: reflection at a plane; Fresnel's law;
+    slopes: C. Cox, W. Munk, J. Opt. Soc. Am. 44, 1954.
     """
     camera_m = T_dock_cam[:3, 3]
     m, k = len(p_dock), knobs.fragments
@@ -149,7 +149,7 @@ def headlamp_w_m2(scenario: Scenario, knobs: Headlamp, p_cam: Array) -> Array:
     a, b = absorption_scattering(scenario.water)
     way = p_cam - np.array(knobs.offset_m)
     far = np.linalg.norm(way, axis=1)
-    watt_sr = intensity(np.array(knobs.power_w), knobs.beam_deg, way[:, 2] / far)
+    watt_sr = intensity(np.array(knobs.power_w), np.array(knobs.beam_deg), way[:, 2] / far)
     return np.asarray((watt_sr / far**2)[:, None] * np.array(SPECTRUM["white"]) * np.exp(-(a + b) * far[:, None]))
 
 

@@ -29,7 +29,7 @@ _STEPS_PER_PX = 2.0  # of a smeared core
 
 @dataclass(frozen=True, slots=True)
 class Mosaic:
-    """Colours of the pixels: quantum efficiency `qe` (C, 3) by channel and band, period, and the channel at each site."""
+    """Colours of the pixels: quantum efficiency `qe` (C, 3) by channel and band, period, channel at each site."""
 
     qe: Array
     step: int
@@ -122,7 +122,7 @@ class Canvas:
         return Core(rows, columns, patch)
 
     def _add_ghost(self, uv: Array, electrons: Array) -> None:
-        """Add the light that comes back from the sensor and the lens once more, out of focus, mirrored at the centre."""
+        """Add the light that sensor and lens throw back and forth: out of focus, mirrored at the centre."""
         knobs = self.lens.knobs
         per_px = knobs.ghost / (np.pi * knobs.ghost_px**2) * electrons
         if per_px.max() < _FAINT_E:

@@ -28,15 +28,16 @@ _TWILIGHT = 0.3  # light on a body's side over that from above
 class Moment:
     """What decides one frame beside the scenario.
 
-    Time `t_s` since the start, `exposure_s`, pose `T_dock_cam` and that an exposure later, where the M lamps really stand,
-    `p_dock` (M, 3), what their windows let through (M,), which are `dark`, pixels of `strays` (S, 2) that look like lamps,
-    the `surface` that mirrors the dock, whether the dock itself is in view, and the number of the run's draws.
+    Time `t_s` since the start, `exposure_s`, pose `T_dock_cam`, and where the camera is an exposure later as seen from
+    there, `T_cam_later`; where the M lamps really stand, `p_dock` (M, 3), what their windows let through,
+    `transmission` (M,), which are `dark`; pixels of `strays` (S, 2) that look like lamps; the `surface` that mirrors the
+    dock, whether the `dock` itself is in view, and the numbers that seed what is drawn for the run.
     """
 
     t_s: float
     exposure_s: float
     T_dock_cam: Array
-    T_dock_later: Array
+    T_cam_later: Array
     p_dock: Array
     transmission: Array
     dark: Indices
@@ -123,9 +124,9 @@ class Studio:
 
     def _smear(self, moment: Moment, seen: Emitters) -> Array:
         """How far (N, 2) px each emitter moves during the exposure."""
-        if not self.scenario.lens.motion or np.array_equal(moment.T_dock_cam, moment.T_dock_later):
+        if not self.scenario.lens.motion or np.array_equal(moment.T_cam_later, np.eye(4)):
             return np.zeros((len(seen), 2))
-        later = transform_points(se3_inverse(moment.T_dock_later) @ moment.T_dock_cam, seen.p_cam)
+        later = transform_points(se3_inverse(moment.T_cam_later), seen.p_cam)
         smear = self.lens.project(later) - self.lens.project(seen.p_cam)
         still = (seen.kind == "injected") | ~np.isfinite(smear).all(axis=1)
         return np.where(still[:, None], 0.0, np.clip(smear, -200.0, 200.0))

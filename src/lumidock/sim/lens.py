@@ -20,8 +20,8 @@ _FIT_GRID, _FIT_STEPS = 15, 8
 class Lens:
     """The real lens: `camera` as it projects without a port, `port` before it, refractive `index` of the water.
 
-    Behind a port `viewpoint_m` is how far before the entrance pupil the origin of `cam` lies: where a calibration in water
-    sees the light come together.
+    Behind a port `viewpoint_m` is how far before the entrance pupil the origin of `cam` lies: where a calibration in
+    water sees the light come together.
     """
 
     knobs: LensKnobs
@@ -48,7 +48,9 @@ class Lens:
         """Pixels (N, 2) of points `p_cam` (N, 3) m in the water; NaN where the lens does not see them."""
         if self.knobs.port is None:
             return self.camera.project(p_cam)
-        return self.camera.project(_bent_by_port(self.knobs.port, self.index, p_cam + [0.0, 0.0, self.viewpoint_m]))
+        return self.camera.project(
+            _bent_by_port(self.knobs.port, self.index, p_cam + np.array([0.0, 0.0, self.viewpoint_m]))
+        )
 
     def rays(self, uv: Array) -> Array:
         """Unit directions `ray_cam` (N, 3) in the water from which pixels `uv` (N, 2) get their light."""

@@ -29,9 +29,9 @@ SPECTRUM = {
 class Emitters:
     """N small bright things in one frame.
 
-    `kind` (N,), `p_cam` (N, 3) m, pixels `uv` (N, 2), photons `at_lens` (N, 3) in each band that would enter the aperture
-    during the exposure if there were no water, the length `range_m` (N,) of their way, radius `window_px` (N,), shares of the
-    light drawn as a core and as a halo (N,), and which are `lit` (N,) and in view.
+    `kind` (N,), `p_cam` (N, 3) m, pixels `uv` (N, 2), photons `at_lens` (N, 3) in each band that would enter the
+    aperture during the exposure if there were no water, the length `range_m` (N,) of their way, the radius
+    `window_px` (N,), shares of the light drawn as `core` and as `halo` (N,), and which are `lit` (N,) and in view.
     """
 
     kind: np.ndarray
@@ -106,7 +106,7 @@ def emission_cosine(p_dock: Array, axis: Array, t_dock_cam: Array) -> Array:
 
 def lamp_watts(scenario: Scenario, station: Station, transmission: Array, duty: float) -> Array:
     """Radiant power (M, 3) W of the station's lamps in each band, `duty` the share of the exposure they are on."""
-    color = station.color
+    color: tuple[str, ...] = station.color
     if scenario.lamps.swap_colors:
         order = station.layers_front_to_rear()
         color = _swapped(station, dict(zip(order, reversed(order), strict=True)))

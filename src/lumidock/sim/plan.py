@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from lumidock.camera import Camera
-from lumidock.datatypes import Array
+from lumidock.datatypes import Array, Indices
 from lumidock.geometry import se3_exp, se3_inverse, se3_log
 from lumidock.sim.frames import Moment, Studio
 from lumidock.sim.knobs import AutoExposure, Surface
@@ -64,7 +65,7 @@ class Plan:
             t_s=t_s,
             exposure_s=exposure_s,
             T_dock_cam=course.T_dock_cam[number],
-            T_dock_later=self._later(number, exposure_s),
+            T_cam_later=self._later(number, exposure_s),
             p_dock=self.world.p_dock[run],
             transmission=share,
             dark=self._dark(number, t_s),
@@ -75,15 +76,15 @@ class Plan:
         )
 
     def _later(self, number: int, exposure_s: float) -> Array:
-        """Pose at the end of the exposure, by the speed toward the next frame, or from the one before."""
+        """T_cam_later at the end of the exposure, by the speed toward the next frame, or from the one before."""
         T, run = self.course.T_dock_cam, self.course.run
         other = number + 1 if number + 1 < len(T) and run[number + 1] == run[number] else number - 1
         if other < 0 or run[other] != run[number]:
-            return T[number]
+            return np.eye(4)
         lapse_s = float(self.course.t_ns[other] - self.course.t_ns[number]) * 1e-9
-        return T[number] @ se3_exp(se3_log(se3_inverse(T[number]) @ T[other]) * (exposure_s / lapse_s))
+        return np.asarray(se3_exp(se3_log(se3_inverse(T[number]) @ T[other]) * (exposure_s / lapse_s)))
 
-    def _dark(self, number: int, t_s: float) -> Array:
+    def _dark(self, number: int, t_s: float) -> Indices:
         """Indices of the lights that do not shine."""
         scenario, station, world = self.scenario, self.station, self.world
         if world.black[number] or not scenario.spots.dock:
@@ -119,7 +120,7 @@ def plan_of(scenario: Scenario, station: Station, camera: Camera, seed: int) -> 
     """Draw what a scenario leaves to the seed; the exposures are those of the sensor's knob."""
     course = course_of(scenario, station, camera, np.random.default_rng([seed, 0]))
     world = world_of(scenario, station, course, np.random.default_rng([seed, 4]))
-    wander = np.empty((len(course.t_ns), 0, 2))
+    wander: Array = np.empty((len(course.t_ns), 0, 2))
     if scenario.path.kind != "draws":
         size = (camera.width, camera.height)
         wander = spurious_paths(scenario, course.t_ns, size, np.random.default_rng([seed, 2]))
@@ -127,14 +128,18 @@ def plan_of(scenario: Scenario, station: Station, camera: Camera, seed: int) -> 
     return Plan(scenario, station, camera, seed, course, world, wander, exposure_s)
 
 
-def metered(plan: Plan, number: int) -> Array:
-    """Histogram (160,) of the light in a frame, electrons per ms, with every 16th pixel counted."""
+def metered(plan: Plan, number: int) -> Indices:
+    """Histogram (160,) of the light in a frame, electrons per ms; each cell of the mosaic counts with its mean."""
     moment = plan.moment(number)
-    light = plan.studio(number).shoot(moment).electrons[::4, ::4] / (1e3 * moment.exposure_s)
-    return np.histogram(np.clip(light, _METER_BINS[0], 0.999 * _METER_BINS[-1]), _METER_BINS)[0]
+    electrons = plan.studio(number).shoot(moment).electrons
+    step = 2 if plan.scenario.output.color else 1
+    cells = cv2.resize(electrons, None, fx=1.0 / step, fy=1.0 / step, interpolation=cv2.INTER_AREA)
+    light = cells / (1e3 * moment.exposure_s)
+    counts = np.histogram(np.clip(light, _METER_BINS[0], 0.999 * _METER_BINS[-1]), _METER_BINS)[0]
+    return np.asarray(counts, np.int64)
 
 
-def controlled(plan: Plan, knobs: AutoExposure, light: list[Array]) -> Array:
+def controlled(plan: Plan, knobs: AutoExposure, light: list[Indices]) -> Array:
     """Exposures (N,) s of the control loop, from each frame's histogram; every frame answers to the one before."""
     sensor, middle = plan.scenario.sensor, np.sqrt(_METER_BINS[1:] * _METER_BINS[:-1])
     full_e = LEVELS * electrons_per_level(sensor)

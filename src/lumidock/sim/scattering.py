@@ -1,4 +1,4 @@
-"""Scattering of light in water: measured phase functions, and the halo that many small deflections draw around a lamp."""
+"""Scattering in water: measured phase functions, and the halo that many small deflections draw around a lamp."""
 
 from __future__ import annotations
 
@@ -8,34 +8,36 @@ import numpy as np
 
 from lumidock.datatypes import Array
 
-# T. Petzold, Volume scattering functions for selected ocean waters, SIO Ref. 72-78, 1972: 1/(m sr) at 530 nm, at 21 angles
-# from 0.1 to 10 degrees evenly in their logarithm and every 5 degrees from there on; the log-log slope below 0.1 degrees
+# T. Petzold, Volume scattering functions for selected ocean waters, SIO Ref. 72-78, 1972: 1/(m sr) at 530 nm, at 21
+# angles from 0.1 to 10 degrees evenly in their logarithm, then every 5 degrees; and the log-log slope below 0.1 degrees
 _ANGLE_DEG = np.concatenate([np.logspace(-1.0, 1.0, 21), np.arange(15.0, 181.0, 5.0)])
 _PETZOLD: dict[str, tuple[float, str]] = {
     # clear: AUTEC 8, Tongue of the Ocean; coastal: HAOCE 11, Catalina Channel; harbour: NUC 2200, San Diego
     "clear": (
         -1.191,
-        "53.18 40.42 30.73 23.73 18.14 13.60 9.954 7.179 5.110 3.591 2.498 1.719 1.171 .7758 .5087 .3340 .2196 .1446 .09522 "
-        ".06282 .04162 .02038 .01099 .006166 .003888 .002680 .001899 .001372 .001020 .0007683 .0006028 .0004883 .0004069 "
-        ".0003457 .0003019 .0002681 .0002459 .0002315 .0002239 .0002225 .0002239 .0002265 .0002339 .0002505 .0002629 "
-        ".0002661 .0002749 .0002896 .0003088 .0003304 .0003627 .0004073 .0004671 .0004845 .0005019",
+        "53.18 40.42 30.73 23.73 18.14 13.60 9.954 7.179 5.110 3.591 2.498 1.719 1.171 .7758 .5087 .3340 .2196 "
+        ".1446 .09522 .06282 .04162 .02038 .01099 .006166 .003888 .002680 .001899 .001372 .001020 .0007683 "
+        ".0006028 .0004883 .0004069 .0003457 .0003019 .0002681 .0002459 .0002315 .0002239 .0002225 .0002239 "
+        ".0002265 .0002339 .0002505 .0002629 .0002661 .0002749 .0002896 .0003088 .0003304 .0003627 .0004073 "
+        ".0004671 .0004845 .0005019",
     ),
     "coastal": (
         -1.545,
-        "653.3 457.7 320.6 225.2 157.9 110.4 77.31 53.70 36.75 24.80 16.62 11.06 7.306 4.750 3.067 1.977 1.273 .8183 .5285 "
-        ".3402 .2155 .09283 .04427 .02390 .01445 .009063 .006014 .004143 .002993 .002253 .001737 .001369 .001094 .0008782 "
-        ".0007238 .0006036 .0005241 .0004703 .0004363 .0004189 .0004073 .0003994 .0003972 .0003984 .0004071 .0004219 "
-        ".0004458 .0004775 .0005232 .0005824 .0006665 .0007823 .0009393 .0009847 .001030",
+        "653.3 457.7 320.6 225.2 157.9 110.4 77.31 53.70 36.75 24.80 16.62 11.06 7.306 4.750 3.067 1.977 1.273 "
+        ".8183 .5285 .3402 .2155 .09283 .04427 .02390 .01445 .009063 .006014 .004143 .002993 .002253 .001737 "
+        ".001369 .001094 .0008782 .0007238 .0006036 .0005241 .0004703 .0004363 .0004189 .0004073 .0003994 "
+        ".0003972 .0003984 .0004071 .0004219 .0004458 .0004775 .0005232 .0005824 .0006665 .0007823 .0009393 "
+        ".0009847 .001030",
     ),
     "harbour": (
         -1.249,
-        "2690 2018 1514 1143 858.8 638.6 471.3 343.4 246.1 173.7 121.0 83.19 56.48 37.38 24.42 15.88 10.29 6.633 4.256 2.720 "
-        "1.732 .7765 .3939 .2475 .1375 .09617 .06867 .04983 .03700 .02782 .02159 .01722 .01402 .01158 .009749 .008344 "
-        ".007241 .006329 .005650 .005113 .004748 .004533 .004368 .004266 .004153 .003965 .003905 .003967 .004106 .004291 "
-        ".004623 .005119 .005814 .006012 .006211",
+        "2690 2018 1514 1143 858.8 638.6 471.3 343.4 246.1 173.7 121.0 83.19 56.48 37.38 24.42 15.88 10.29 6.633 "
+        "4.256 2.720 1.732 .7765 .3939 .2475 .1375 .09617 .06867 .04983 .03700 .02782 .02159 .01722 .01402 .01158 "
+        ".009749 .008344 .007241 .006329 .005650 .005113 .004748 .004533 .004368 .004266 .004153 .003965 .003905 "
+        ".003967 .004106 .004291 .004623 .005119 .005814 .006012 .006211",
     ),
 }
-# grids of the Hankel transforms, all even in the logarithm: products k theta, angles where the halo is tabulated, frequencies
+# grids of the Hankel transforms, even in the logarithm: products k theta, angles where the halo is tabulated
 _STEP, _STRIDE = 0.012, 12
 _PRODUCT = np.exp(np.arange(np.log(1e-5), np.log(60.0), _STEP))
 _HALO_RAD = np.exp(np.arange(96) * _STRIDE * _STEP + np.log(2e-6))
@@ -92,7 +94,7 @@ def _kernel() -> Array:
 
 
 def _hankel(values: Array, variable: Array) -> Array:
-    """Integral of values f(t / v) J0(t) t dt / v^2 at each `variable` v; `values` fall on the grid that fits `_hankel_grid`.
+    """Integral of f(t / v) J0(t) t dt / v^2 at each `variable` v; `values` of f are those on its `_hankel_grid`.
 
     Source: a Hankel transform on logarithmic grids is a correlation; A. Hamilton, MNRAS 312, 2000.
     """

@@ -152,7 +152,9 @@ class Scenario(Section):
     stream: Stream = Stream()
     faults: Faults = Faults()
     spots: Spots = Spots()
-    config: dict[str, Any] = {}  # settings of the method that the scenario needs, as in a configuration file
+    config: dict[str, Any] = Field(
+        default_factory=dict
+    )  # settings of the method that the scenario needs, as in a configuration file
 
     @model_validator(mode="after")
     def _mirrored_camera_can_be_turned(self) -> Self:

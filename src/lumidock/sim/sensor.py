@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lumidock.datatypes import Array
+from lumidock.datatypes import Array, Indices
 from lumidock.sim.knobs import Output, Sensor
 
 LEVELS = 4095  # 12 bit
@@ -48,21 +48,22 @@ def picture(raw: NDArray[np.uint16], sensor: Sensor, output: Output) -> np.ndarr
     8-bit pictures have the gamma of the knob, except raw mosaics; 16-bit ones are linear.
     """
     if output.pixels == "bayer16":
-        return raw << _MONO16_SHIFT
+        return np.left_shift(raw, _MONO16_SHIFT)
     if output.pixels == "bayer8":
-        return (raw >> _MONO16_SHIFT).astype(np.uint8)
+        return np.right_shift(raw, _MONO16_SHIFT).astype(np.uint8)
     developed = cv2.demosaicing(raw, _TO_BGR[output.pattern]) if output.color else raw
     if output.color and output.pixels != "bgr8":
         developed = cv2.cvtColor(developed, cv2.COLOR_BGR2GRAY)
     if output.pixels == "mono16":
-        return np.asarray(developed << _MONO16_SHIFT)
+        return np.left_shift(np.asarray(developed, np.uint16), _MONO16_SHIFT)
     return np.asarray(_gamma_table(sensor.gamma)[developed])
 
 
-def hot_pixels(sensor: Sensor, shape: tuple[int, int], rng: np.random.Generator) -> tuple[Array, Array]:
+def hot_pixels(sensor: Sensor, shape: tuple[int, int], rng: np.random.Generator) -> tuple[Indices, Array]:
     """Rows and columns (2, K) of pixels with a large dark current, and that (K,) in electrons a second."""
     at = rng.integers(0, np.array(shape)[:, None], (2, sensor.hot_pixels))
-    return at, np.exp(rng.uniform(*np.log(sensor.hot_e_s), sensor.hot_pixels))
+    low, high = np.log(sensor.hot_e_s).tolist()
+    return at, np.exp(rng.uniform(low, high, sensor.hot_pixels))
 
 
 def _gamma_table(gamma: float) -> np.ndarray:

@@ -65,7 +65,7 @@ def render_frame(
         t_s=0.0,
         exposure_s=scenario.sensor.exposure_ms * 1e-3,
         T_dock_cam=T_dock_cam,
-        T_dock_later=T_dock_cam,
+        T_cam_later=np.eye(4),
         p_dock=station.p_dock,
         transmission=np.ones(m),
         dark=np.asarray(dark, np.int64),

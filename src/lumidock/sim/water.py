@@ -12,9 +12,9 @@ from lumidock.sim.knobs import Water
 
 BAND_NM = np.array([455.0, 530.0, 610.0])
 
-# absorption and scattering 1/m, total (water and what is in it). Jerlov types: C. Williamson, R. Hollins, Applied Optics
-# 61, 2022 (measured); 7C and pure sea water: M. Solonenko, C. Mobley, Applied Optics 54, 2015. Published values of b differ
-# by factors: `water.b_factor` sweeps it.
+# absorption and scattering 1/m, of water and all that is in it. Jerlov types: C. Williamson, R. Hollins, Applied Optics
+# 61, 2022 (measured); 7C and pure sea water: M. Solonenko, C. Mobley, Applied Optics 54, 2015. Published values of b
+# differ by factors: `water.b_factor` sweeps it.
 _IOP: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "pure-sea": ((0.0119, 0.0429, 0.269), (0.0043, 0.0022, 0.0012)),
     "IB": ((0.0398, 0.0519, 0.273), (0.134, 0.124, 0.117)),
@@ -24,18 +24,19 @@ _IOP: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] =
     "3C": ((0.191, 0.128, 0.314), (0.684, 0.652, 0.624)),
     "5C": ((0.295, 0.169, 0.333), (1.27, 1.21, 1.16)),
     "7C": ((0.511, 0.225, 0.327), (3.24, 2.50, 1.97)),
-    # No survey of pools is known to us. Clear: pure water and 0.05 /m of fine particles at 530 nm, which is b at the turbidity
-    # limit of well kept pools (0.2-0.5 NTU, at 0.1-0.3 /m per NTU); murky: ten times that and a little yellow matter, as in test
-    # tanks whose filters are off. b falls with the wavelength as 1/lambda, as for particles of all sizes.
+    # No survey of pools is known. Clear: pure water and 0.05 /m of fine particles at 530 nm, b at the turbidity of pools
+    # that are well kept (0.2-0.5 NTU, at 0.1-0.3 /m per NTU). Murky: ten times that and a little yellow matter, as in
+    # test tanks whose filters are off. b falls as 1 / wavelength, as for particles of all sizes.
     "pool-clear": ((0.0105, 0.0445, 0.264), (0.058, 0.050, 0.043)),
     "pool-murky": ((0.0500, 0.0650, 0.275), (0.580, 0.500, 0.430)),
 }
 # Petzold's water that scatters like it; harbour, nearest to the mean over particles with which the tables were derived
 _PHASE = {"pure-sea": "clear"}
-# change of a per psu and per kelvin. Source: J. Sullivan et al., Applied Optics 45, 2006, as tabulated by R. Roettgers, WOPP 3
+# change of a per psu and per kelvin. Source: J. Sullivan et al., Applied Optics 45, 2006, as tabulated in WOPP 3 by
+# R. Roettgers, 2011
 _A_PER_PSU, _A_PER_KELVIN = np.array([0.0, 1.4e-5, 3.5e-5]), np.array([0.0, 1.8e-5, 9.2e-4])
 _A_TABLE_PSU, _A_TABLE_C = 35.0, 20.0  # at which the table holds
-_SIGHT_DOWN_COSINE = 0.85  # mean cosine of daylight below the surface
+_DOWNWARD_COSINE = 0.85  # mean cosine of daylight below the surface
 
 
 def absorption_scattering(water: Water) -> tuple[Array, Array]:
@@ -68,4 +69,4 @@ def green_index(water: Water) -> float:
 
 def diffuse_attenuation(a: Array, backscatter: Array) -> Array:
     """Decay 1/m of daylight with depth: 1.04 (a + bb) over the mean cosine. Source: H. Gordon, L&O 34, 1989."""
-    return np.asarray(1.04 * (a + backscatter) / _SIGHT_DOWN_COSINE)
+    return np.asarray(1.04 * (a + backscatter) / _DOWNWARD_COSINE)
