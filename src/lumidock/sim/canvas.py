@@ -229,11 +229,12 @@ class Core:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Profile:
-    """A halo: electrons per pixel (R, C) at angles even in their logarithm, and its `reach_px`."""
+    """A halo: electrons per pixel (R, C) at angles even in their logarithm, their rises, and its `reach_px`."""
 
     first: float
     per_ring: float
     values: Array
+    rises: Array
     reach_px: float
 
     @classmethod
@@ -243,24 +244,29 @@ class Profile:
         values = np.stack([np.interp(logs, np.log(theta), column) for column in electrons.T], axis=1)
         bright = np.flatnonzero(values.max(axis=1) > _FAINT_E)
         reach = float(np.exp(logs[bright[-1]]) * focal_px) if len(bright) else 0.0
-        return cls(float(logs[0]), float(1.0 / (logs[1] - logs[0])), values.astype(np.float32), reach)
+        values = values.astype(np.float32)
+        return cls(float(logs[0]), float(1.0 / (logs[1] - logs[0])), values, np.diff(values, axis=0), reach)
 
     def at(self, theta: Array, inner: float, outer: float) -> Array:
         """Electrons (..., C) at angles, faded in at `inner` and out at `outer` so that the canvases add up to one."""
-        place = np.clip((np.log(np.maximum(theta, 1e-12)) - self.first) * self.per_ring, 0.0, _HALO_RINGS - 1.001)
-        ring = place.astype(np.int64)
-        part = (place - ring).astype(np.float32)[..., None]
-        weight = _fade(theta, outer) - (_fade(theta, inner) if inner > 0.0 else 0.0)
-        values = self.values[ring] * (1.0 - part) + self.values[ring + 1] * part
-        return np.asarray(values * np.broadcast_to(np.asarray(weight, np.float32), theta.shape)[..., None])
+        theta = np.maximum(theta, 1e-12, dtype=np.float32)
+        place = (np.log(theta) - np.float32(self.first)) * np.float32(self.per_ring)
+        np.clip(place, 0.0, _HALO_RINGS - 1.01, out=place)
+        ring = place.astype(np.intp)
+        place -= ring
+        values = self.values.take(ring, axis=0)
+        values += place[..., None] * self.rises.take(ring, axis=0)
+        if np.isfinite(outer):
+            values *= _fade(theta, outer)[..., None]
+        if inner > 0.0:
+            values *= (np.float32(1.0) - _fade(theta, inner))[..., None]
+        return np.asarray(values)
 
 
-def _fade(theta: Array, end: float) -> Array | float:
-    """One up to 0.4 of `end`, zero from `end` on, smooth between."""
-    if np.isinf(end):
-        return 1.0
-    x = np.clip((theta / end - 0.4) / 0.6, 0.0, 1.0)
-    return np.asarray(1.0 - x * x * x * (10.0 - 15.0 * x + 6.0 * x * x))
+def _fade(theta: Array, end: float) -> Array:
+    """One up to 0.4 of `end`, zero from `end` on, smooth between; float32."""
+    x = np.clip((theta * np.float32(1.0 / end) - np.float32(0.4)) * np.float32(1.0 / 0.6), 0.0, 1.0)
+    return np.asarray(np.float32(1.0) - x * x * x * (np.float32(10.0) - x * (np.float32(15.0) - np.float32(6.0) * x)))
 
 
 def _nodes(shape: tuple[int, ...], stride: int) -> Array:
@@ -279,8 +285,8 @@ def _around(at: Array, reach: int, shape: tuple[int, ...]) -> tuple[slice, slice
 
 def _angles(J_ray_uv: Array, du: Array, dv: Array) -> Array:
     """Angles (V, U) from the emitter of pixels at offsets `du` (U,), `dv` (V,)."""
-    (uu, uv_), (_, vv) = J_ray_uv.T @ J_ray_uv
-    return np.asarray(np.sqrt(uu * du[None, :] ** 2 + 2.0 * uv_ * du[None, :] * dv[:, None] + vv * dv[:, None] ** 2))
+    (uu, cross), (_, vv) = J_ray_uv.T @ J_ray_uv
+    return np.asarray(np.sqrt(uu * du[None, :] ** 2 + 2.0 * cross * du[None, :] * dv[:, None] + vv * dv[:, None] ** 2))
 
 
 def core_profile(du: Array, dv: Array, window_px: float, blur_px: float, smear_px: Array | None = None) -> Array:

@@ -30,8 +30,8 @@ class Moment:
 
     Time `t_s` since the start, `exposure_s`, pose `T_dock_cam`, and where the camera is an exposure later as seen from
     there, `T_cam_later`; where the M lamps really stand, `p_dock` (M, 3), what their windows let through,
-    `transmission` (M,), which are `dark`; pixels of `strays` (S, 2) that look like lamps; the `surface` that mirrors the
-    dock, whether the `dock` itself is in view, and the numbers that seed what is drawn for the run.
+    `transmission` (M,), which are `dark`; pixels of `strays` (S, 2) that look like lamps; the `surface` that mirrors
+    the dock, whether the `dock` itself is in view, and the numbers that seed what is drawn for the run.
     """
 
     t_s: float

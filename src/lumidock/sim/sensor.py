@@ -10,6 +10,7 @@ from lumidock.datatypes import Array, Indices
 from lumidock.sim.knobs import Output, Sensor
 
 LEVELS = 4095  # 12 bit
+_ROWS = 16
 _MONO16_SHIFT = 4  # 12 bit in the upper part of 16
 _TO_BGR = {
     "rggb": cv2.COLOR_BayerRGGB2BGR,
@@ -34,12 +35,18 @@ def read_out(electrons: Array, sensor: Sensor, rng: np.random.Generator) -> NDAr
 
     Shot noise (Gaussian limit), full well, read noise, gain, rounding. Source: EMVA 1288, release 4, camera model.
     """
-    levels = rng.standard_normal(electrons.shape, np.float32)  # in place from here on: noise, electrons, levels
-    levels *= np.sqrt(electrons + np.float32(sensor.read_noise_e**2))
-    levels += electrons
-    np.minimum(levels, np.float32(sensor.full_well_e), out=levels)
-    levels *= np.float32(1.0 / electrons_per_level(sensor))
-    return np.asarray(np.clip(np.rint(levels, out=levels), 0, LEVELS).astype(np.uint16))
+    raw, block = np.empty(electrons.shape, np.uint16), np.empty((2, _ROWS, electrons.shape[1]), np.float32)
+    for row in range(0, len(raw), _ROWS):  # a few rows at a time stay in the cache
+        light = electrons[row : row + _ROWS]
+        levels, sigma = block[:, : len(light)]
+        rng.standard_normal(dtype=np.float32, out=levels)
+        np.sqrt(np.add(light, np.float32(sensor.read_noise_e**2), out=sigma), out=sigma)
+        levels *= sigma
+        levels += light
+        np.minimum(levels, np.float32(sensor.full_well_e), out=levels)
+        levels *= np.float32(1.0 / electrons_per_level(sensor))
+        raw[row : row + _ROWS] = np.clip(np.rint(levels, out=levels), 0, LEVELS, out=levels)
+    return raw
 
 
 def picture(raw: NDArray[np.uint16], sensor: Sensor, output: Output) -> np.ndarray:

@@ -138,7 +138,7 @@ def _write_frame(plan: Plan, out: Path, row: Row) -> _Written:
     if row.fault == "over_exposed":
         moment = replace(moment, exposure_s=moment.exposure_s * OVER_EXPOSED)
     shot = studio.shoot(moment)
-    image = studio.develop(shot, np.random.default_rng([plan.seed, 9, row.shows]))
+    image = studio.develop(shot, np.random.Generator(np.random.SFC64([plan.seed, 9, row.shows])))
     if row.fault in ("black", "white"):
         image[...] = 0 if row.fault == "black" else np.iinfo(image.dtype).max
     path = out / "frames" / _file_of(row, scenario)

@@ -24,8 +24,8 @@ _IOP: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] =
     "3C": ((0.191, 0.128, 0.314), (0.684, 0.652, 0.624)),
     "5C": ((0.295, 0.169, 0.333), (1.27, 1.21, 1.16)),
     "7C": ((0.511, 0.225, 0.327), (3.24, 2.50, 1.97)),
-    # No survey of pools is known. Clear: pure water and 0.05 /m of fine particles at 530 nm, b at the turbidity of pools
-    # that are well kept (0.2-0.5 NTU, at 0.1-0.3 /m per NTU). Murky: ten times that and a little yellow matter, as in
+    # No survey of pools is known. Clear: pure water and 0.05 /m of fine particles at 530 nm, b at the turbidity of
+    # well kept pools (0.2-0.5 NTU, at 0.1-0.3 /m per NTU). Murky: ten times that and a little yellow matter, as in
     # test tanks whose filters are off. b falls as 1 / wavelength, as for particles of all sizes.
     "pool-clear": ((0.0105, 0.0445, 0.264), (0.058, 0.050, 0.043)),
     "pool-murky": ((0.0500, 0.0650, 0.275), (0.580, 0.500, 0.430)),
