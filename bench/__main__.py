@@ -11,9 +11,16 @@ import sys
 import time
 from pathlib import Path
 
-from bench import doors, images, speed, table1
+from bench import contact_sheet, doors, images, speed, table1, visibility
 
-BENCHES = {"doors": doors, "table1": table1, "images": images, "speed": speed}
+BENCHES = {
+    "doors": doors,
+    "table1": table1,
+    "images": images,
+    "speed": speed,
+    "visibility": visibility,
+    "contact-sheet": contact_sheet,
+}
 
 
 def main() -> None:

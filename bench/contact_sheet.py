@@ -1,0 +1,65 @@
+"""The contact sheet of the README: how the shipped dock looks over range and water, into docs/contact-sheet.jpg."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bench.shipped import shipped_camera, shipped_station
+from lumidock.datatypes import Image
+from lumidock.sim.plan import plan_of
+from lumidock.sim.scenario import R_DOCK_CAM_HEAD_ON, load_scenario
+
+SHEET = Path("docs/contact-sheet.jpg")
+ROWS = {  # scenario, further settings
+    "Jerlov IB": ("water-ib", ()),
+    "Jerlov III": ("approach", ()),
+    "Jerlov 3C, 6 ms": ("water-3c", ()),
+    "clear pool": ("pool", ()),
+    "murky pool": ("pool-murky", ()),
+    "own headlamp, snow": ("headlamp", ()),
+}
+RANGES_M = (18.0, 9.0, 3.0, -2.0)
+_TILE, _GAP = (460, 384), 4
+_MARGIN = 1.7  # of the dock's size, which fills each tile
+
+
+def picture(scenario: str, settings: tuple[str, ...], z_m: float) -> Image:
+    """A frame from the dock's axis."""
+    station = shipped_station()
+    plan = plan_of(load_scenario(scenario, settings), station, shipped_camera(), 0)
+    T_dock_cam = np.eye(4)
+    T_dock_cam[:3, :3], T_dock_cam[2, 3] = R_DOCK_CAM_HEAD_ON, z_m
+    moment = replace(plan.moment(0), t_s=30.0 - z_m, T_dock_cam=T_dock_cam, T_cam_later=np.eye(4))
+    studio = plan.studio(0)
+    return np.asarray(studio.develop(studio.shoot(moment), np.random.default_rng(0)), np.uint8)
+
+
+def tile(image: Image, z_m: float) -> Image:
+    """The part of a frame around the dock, larger the farther it is; at most the whole frame."""
+    height, width = image.shape[:2]
+    span = min(_MARGIN * 2.0 * 2087.0 / max(z_m, 0.1), float(height))
+    half = np.array([span * _TILE[0] / _TILE[1], span]) / 2.0
+    (u0, v0), (u1, v1) = (np.clip(np.array([width, height]) / 2 + sign * half, 0, [width, height]) for sign in (-1, 1))
+    part = image[int(v0) : int(v1), int(u0) : int(u1)]
+    return np.asarray(cv2.resize(part, _TILE, interpolation=cv2.INTER_AREA if span > _TILE[1] else cv2.INTER_CUBIC))
+
+
+def main() -> tuple[dict[str, object], list[str]]:
+    """Draw and save it."""
+    rows = []
+    for name, (scenario, settings) in ROWS.items():
+        tiles = [tile(picture(scenario, settings, z), z) for z in RANGES_M]
+        for image, z in zip(tiles, RANGES_M, strict=True):
+            text = name if z == RANGES_M[0] else ""
+            cv2.putText(image, text, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (230, 230, 230), 1, cv2.LINE_AA)
+            cv2.putText(
+                image, f"z = {z:g} m", (10, 372), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (170, 170, 170), 1, cv2.LINE_AA
+            )
+        rows.append(cv2.hconcat([cv2.copyMakeBorder(t, 0, _GAP, 0, _GAP, cv2.BORDER_CONSTANT) for t in tiles]))
+    SHEET.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(SHEET), cv2.vconcat(rows), [cv2.IMWRITE_JPEG_QUALITY, 88])
+    return {"sheet": str(SHEET)}, [f"![The dock over range and water]({SHEET})"]
