@@ -16,7 +16,7 @@ from lumidock.sim.water import absorption_scattering, diffuse_attenuation, phase
 from lumidock.station import Station
 
 _SNOW_TILE_M = 8.0  # the same particles come again at this distance
-_FAR_M = 100.0
+_NEAREST_M, _FAR_M = 0.15, 100.0
 _LAMP_STEPS = 28
 _FORWARD_RAD = np.deg2rad(30.0)  # daylight comes from a cone about this wide
 
@@ -72,7 +72,8 @@ def mirrored(
         exposure_s,
         halo=0.0,
     )
-    halos = emitters("mirror", lens, transform_points(T_cam_dock, still), watt_sr, radius_m, exposure_s, core=0.0)
+    spread_m = np.hypot(radius_m, 2.0 * knobs.slope * below)  # of the fragments, whose halos run together
+    halos = emitters("mirror", lens, transform_points(T_cam_dock, still), watt_sr, spread_m, exposure_s, core=0.0)
     return [cores, halos]
 
 
@@ -133,10 +134,10 @@ def snow(
     p_dock = tile + np.array(knobs.drift_m_s) * t_s - camera_m
     p_dock = (p_dock + 0.5 * _SNOW_TILE_M) % _SNOW_TILE_M - 0.5 * _SNOW_TILE_M
     p_cam = p_dock @ T_dock_cam[:3, :3]
-    close = (
-        (p_cam[:, 2] > 0.15) & (p_cam[:, 2] < knobs.reach_m) & (np.abs(p_cam[:, :2]) < 1.2 * p_cam[:, 2:]).all(axis=1)
-    )
+    close = (p_cam[:, 2] > _NEAREST_M) & (p_cam[:, 2] < knobs.reach_m)
     p_cam, radius = p_cam[close], radius[close]
+    shown = lens.camera.contains(lens.project(p_cam))
+    p_cam, radius = p_cam[shown], radius[shown]
     light = daylight_w_m2(scenario, camera_m[1])[None] * np.ones((len(p_cam), 1))
     if scenario.around.headlamp is not None:
         light = light + headlamp_w_m2(scenario, scenario.around.headlamp, p_cam)
