@@ -239,6 +239,8 @@ def test_a_video_holds_the_pictures(tmp_path):
     items = list(open_source(out / "video.mp4").items())
     assert len(items) == len(read(out / "timestamps.csv")) == 9
     assert not (out / "frames").exists()
+    with pytest.raises(InputError, match="a video holds"):
+        written(tmp_path / "raw", "approach", "output={pixels: bayer8, file: png}", video=True)
 
 
 def test_a_wrong_calibration_is_wrong_by_what_it_says(tmp_path):
@@ -299,6 +301,18 @@ def test_the_clock_jumps_and_goes_on_from_there():
     steps = np.diff([row.t_ns for row in rows(clock_jump_s=0.8, clock_jumps=0.01)])
     assert set(steps) == {150_000_000, 950_000_000}
     assert min(np.diff([row.t_ns for row in rows(clock_jump_s=-3.0, clock_jumps=0.01)])) < 0
+
+
+def test_a_doubled_row_has_one_file_and_one_truth(tmp_path):
+    out = written(tmp_path, "approach", "stream={duplicated: 0.9, half_written: 0.5}", workers=2)
+    stamps = [row["frame"] for row in read(out / "timestamps.csv")]
+    assert len(stamps) > len(set(stamps)) == 9
+    assert [row["frame"] for row in read(out / "truth.csv")] == sorted(set(stamps))
+    halves = {row["frame"] for row in read(out / "stream_truth.csv") if row["fault"] == "half_written"}
+    whole = written(tmp_path / "whole", "approach") / "frames"
+    for frame in halves:
+        half, all_of_it = ((folder / f"{frame}.jpg").stat().st_size for folder in (out / "frames", whole))
+        assert half == all_of_it // 2
 
 
 def test_spoilt_files_are_what_a_reader_gets(tmp_path):

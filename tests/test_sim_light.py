@@ -33,7 +33,8 @@ def lens_of(lens_knobs=BARE, camera=CAMERA):
 
 
 def lamp(p_cam, watt_sr=(0.2, 0.3, 0.2), radius_m=0.0175, lens=None):
-    return optics.emitters("lamp", lens or lens_of(), np.array([p_cam]), np.array([watt_sr]), radius_m, EXPOSURE_S)
+    view = optics.View(lens or lens_of(), np.eye(4), EXPOSURE_S)
+    return optics.emitters("lamp", view, np.array([p_cam]), np.array([watt_sr]), radius_m)
 
 
 def drawn(seen, absorption, scattering, phase="harbour", output=MONO, lens=None):
@@ -197,7 +198,7 @@ def test_beam_falls_to_half_at_its_half_angle():
         T[:3, :3] = R_DOCK_CAM_HEAD_ON @ np.array(cv2.Rodrigues(np.array([0.0, -angle, 0.0]))[0])
         T[:3, 3] = STATION.p_dock[0] + 5.0 * np.array([np.sin(angle), 0, np.cos(angle)])
         watts = optics.lamp_watts(SCENARIO, STATION, np.ones(len(STATION)), 1.0)
-        seen = optics.lamps(SCENARIO, lens_of(), STATION, STATION.p_dock, watts, T, EXPOSURE_S)
+        seen = optics.lamps(optics.View(lens_of(), T, EXPOSURE_S), STATION, STATION.p_dock, watts, 0.0175)
         assert seen.lit[0]
         return seen.at_lens[0, 1]
 
@@ -230,7 +231,8 @@ def test_projection_agrees_with_opencv(distortion):
     T_cam_dock = se3_inverse(T)
     uv, _ = cv2.projectPoints(STATION.p_dock, so3_log(T_cam_dock[:3, :3]), T_cam_dock[:3, 3], CAMERA.K, distortion)
     watts = np.ones((len(STATION), 3))
-    seen = optics.lamps(SCENARIO, lens_of(camera=camera), STATION, STATION.p_dock, watts, T, EXPOSURE_S)
+    view = optics.View(lens_of(camera=camera), T, EXPOSURE_S)
+    seen = optics.lamps(view, STATION, STATION.p_dock, watts, 0.0175)
     np.testing.assert_allclose(seen.uv, uv[:, 0], atol=1e-6)
 
 
@@ -276,9 +278,8 @@ def test_a_calm_surface_shows_each_lamp_where_a_mirror_would(rng):
     T = head_on(8.0)
     surface = knobs.Surface(height_m=1.7, slope=0.0, fragments=2)
     watts = np.ones((len(STATION), 3))
-    cores, halos = around.mirrored(
-        surface, lens_of(), STATION, STATION.p_dock, watts, T, 0.0175, EXPOSURE_S, 0.3, rng, 1.34
-    )
+    view = optics.View(lens_of(), T, EXPOSURE_S, t_s=0.3)
+    cores, halos = around.mirrored(surface, 1.34, view, STATION, STATION.p_dock, watts, 0.0175, rng)
     image = STATION.p_dock * [1, -1, 1] + [0, 3.4, 0]
     p_cam = (image - T[:3, 3]) @ T[:3, :3]
     np.testing.assert_allclose(halos.p_cam, p_cam, atol=1e-12)
@@ -358,3 +359,22 @@ def test_noise_follows_the_photon_transfer_curve(gain_db):
     full = sensor.read_out(np.full((100, 100), 1e5, np.float32), settings, np.random.default_rng(1))
     assert full.max() == 4095
     assert full.min() > 4080
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 4.0), (1.2, -0.8, 4.0)])
+def test_a_halo_is_on_the_picture_what_it_is_in_the_table(place):
+    """On all three canvases, at the centre of the picture and near its corner, where pixels see less."""
+    lens, seen = lens_of(), lamp(place, (0.0, 1e4, 0.0), radius_m=1e-4)
+    picture = drawn(seen, (1.0, 0.1, 1.0), (0.0, 0.3, 0.0), "harbour")
+    theta, values = halo(0.1, 0.3, "harbour", float(f"{seen.range_m[0]:.3g}"))
+    alone = seen.at_lens[0, 1] / lens.throughput(seen.uv)[0] * 0.65
+    ray = lens.rays(seen.uv)[0]
+    for reach_px in (12, 40, 90, 200, 400, 700):
+        for turn in np.arange(0.0, 2 * np.pi, 0.7):
+            at = np.round(seen.uv + reach_px * np.array([[np.cos(turn), np.sin(turn)]]))
+            if not CAMERA.contains(at, margin_px=20)[0]:
+                continue
+            angle = np.arccos(lens.rays(at)[0] @ ray)
+            share = np.exp(np.interp(np.log(angle), np.log(theta), np.log(values)))
+            wanted = alone * share * lens.solid_angle(at)[0] * lens.throughput(at)[0]
+            assert picture[int(at[0, 1]), int(at[0, 0])] == pytest.approx(wanted, rel=0.05), (reach_px, turn)

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from lumidock.datatypes import Array
-from lumidock.geometry import se3_inverse, transform_points
 from lumidock.sim.canvas import Canvas
 from lumidock.sim.knobs import Glints, Headlamp, Snow, Surface, Vehicle
-from lumidock.sim.lens import Lens
-from lumidock.sim.optics import PHOTON_J, SPECTRUM, Emitters, emission_cosine, emitters, intensity
+from lumidock.sim.optics import PHOTON_J, SPECTRUM, Emitters, View, emission_cosine, emitters, intensity
 from lumidock.sim.scattering import backscatter_share, phase_at
 from lumidock.sim.scenario import Scenario
 from lumidock.sim.water import absorption_scattering, diffuse_attenuation, phase_kind
@@ -17,32 +15,31 @@ from lumidock.station import Station
 
 _SNOW_TILE_M = 8.0  # the same particles come again at this distance
 _NEAREST_M, _FAR_M = 0.15, 100.0
+_GLINT_M = 0.006  # radius of a glint
+_ABREAST = np.array([0.9, 0.15, 0.4])  # along which another vehicle's lamps stand
 _LAMP_STEPS = 28
 _FORWARD_RAD = np.deg2rad(30.0)  # daylight comes from a cone about this wide
 
 
 def mirrored(
     knobs: Surface,
-    lens: Lens,
+    index: float,
+    view: View,
     station: Station,
     p_dock: Array,
     watts: Array,
-    T_dock_cam: Array,
     radius_m: float,
-    exposure_s: float,
-    t_s: float,
     rng: np.random.Generator,
-    index: float,
 ) -> list[Emitters]:
     """Images of M lamps in a rough surface: a halo for each image, and a core for each of its fragments.
 
     Every fragment is the image in a facet whose slope follows the waves. Source: reflection at a plane; Fresnel's law;
     slopes: C. Cox, W. Munk, J. Opt. Soc. Am. 44, 1954.
     """
-    camera_m = T_dock_cam[:3, 3]
+    camera_m = view.T_dock_cam[:3, 3]
     m, k = len(p_dock), knobs.fragments
     period = knobs.period_s * rng.uniform(0.6, 1.6, (3, m, k))
-    wave = np.sin(2.0 * np.pi * t_s / period + rng.uniform(0.0, 2.0 * np.pi, (3, m, k)))
+    wave = np.sin(2.0 * np.pi * view.t_s / period + rng.uniform(0.0, 2.0 * np.pi, (3, m, k)))
     below, own = knobs.height_m - p_dock[:, 1], knobs.height_m - camera_m[1]
     if own <= 0.0 or (below <= 0.0).any():
         return []
@@ -62,18 +59,10 @@ def mirrored(
     path_m = np.linalg.norm(still - camera_m, axis=1)
     back = fresnel((below + own) / path_m, index)
     watt_sr = (intensity(np.ones(m), station.beam_deg, cosine) * back)[:, None] * watts
-    T_cam_dock = se3_inverse(T_dock_cam)
-    cores = emitters(
-        "mirror",
-        lens,
-        transform_points(T_cam_dock, image.reshape(-1, 3)),
-        np.repeat(watt_sr, k, axis=0) * share.reshape(-1, 1),
-        radius_m,
-        exposure_s,
-        halo=0.0,
-    )
+    fragments = np.repeat(watt_sr, k, axis=0) * share.reshape(-1, 1)
+    cores = emitters("mirror", view, view.p_cam(image.reshape(-1, 3)), fragments, radius_m, halo=0.0)
     spread_m = np.hypot(radius_m, 2.0 * knobs.slope * below)  # of the fragments, whose halos run together
-    halos = emitters("mirror", lens, transform_points(T_cam_dock, still), watt_sr, spread_m, exposure_s, core=0.0)
+    halos = emitters("mirror", view, view.p_cam(still), watt_sr, spread_m, core=0.0)
     return [cores, halos]
 
 
@@ -87,62 +76,42 @@ def fresnel(cosine: Array, index: float) -> Array:
 
 
 def glints(
-    knobs: Glints,
-    lens: Lens,
-    station: Station,
-    p_dock: Array,
-    watts: Array,
-    T_dock_cam: Array,
-    exposure_s: float,
-    rng: np.random.Generator,
+    knobs: Glints, view: View, station: Station, p_dock: Array, watts: Array, rng: np.random.Generator
 ) -> Emitters:
     """Reflections on the tube beside each of M lamps, outward from the dock's axis."""
     outward = p_dock * [1.0, 1.0, 0.0]
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-    share = rng.uniform(*knobs.share, len(p_dock))
-    watt_sr = (share / (2.0 * np.pi) * (emission_cosine(p_dock, station.axis, T_dock_cam[:3, 3]) > 0.0))[
-        :, None
-    ] * watts
-    at = transform_points(se3_inverse(T_dock_cam), p_dock + knobs.offset_m * outward)
-    return emitters("glint", lens, at, watt_sr, 0.006, exposure_s, halo=0.0)
+    before = emission_cosine(p_dock, station.axis, view.T_dock_cam[:3, 3]) > 0.0
+    watt_sr = (rng.uniform(*knobs.share, len(p_dock)) / (2.0 * np.pi) * before)[:, None] * watts
+    return emitters("glint", view, view.p_cam(p_dock + knobs.offset_m * outward), watt_sr, _GLINT_M, halo=0.0)
 
 
-def vehicle(knobs: Vehicle, lens: Lens, T_dock_cam: Array, radius_m: float, exposure_s: float, t_s: float) -> Emitters:
+def vehicle(knobs: Vehicle, view: View, radius_m: float) -> Emitters:
     """Lamps of another vehicle, side by side, shining all around."""
     side = (np.arange(knobs.lamps) - 0.5 * (knobs.lamps - 1)) * knobs.spacing_m
-    middle = np.array(knobs.start) + np.array(knobs.velocity_m_s) * t_s
-    at = middle + side[:, None] * [0.9, 0.15, 0.4]
+    middle = np.array(knobs.start) + np.array(knobs.velocity_m_s) * view.t_s
     watt_sr = np.tile(knobs.power_w / (4.0 * np.pi) * np.array(SPECTRUM[knobs.color]), (knobs.lamps, 1))
-    return emitters("vehicle", lens, transform_points(se3_inverse(T_dock_cam), at), watt_sr, radius_m, exposure_s)
+    return emitters("vehicle", view, view.p_cam(middle + side[:, None] * _ABREAST), watt_sr, radius_m)
 
 
-def snow(
-    knobs: Snow,
-    scenario: Scenario,
-    lens: Lens,
-    T_dock_cam: Array,
-    exposure_s: float,
-    t_s: float,
-    rng: np.random.Generator,
-) -> Emitters:
+def snow(knobs: Snow, scenario: Scenario, view: View, rng: np.random.Generator) -> Emitters:
     """Particles that keep their places while the camera moves through them, in the light of headlamp and day."""
     count = int(knobs.per_m3 * _SNOW_TILE_M**3)
     tile, share = rng.uniform(0.0, _SNOW_TILE_M, (count, 3)), rng.random(count)
     low, high = (1e-3 * value for value in knobs.radius_mm)
     radius = (low**-2.0 - share * (low**-2.0 - high**-2.0)) ** -0.5
-    camera_m = T_dock_cam[:3, 3]
-    p_dock = tile + np.array(knobs.drift_m_s) * t_s - camera_m
-    p_dock = (p_dock + 0.5 * _SNOW_TILE_M) % _SNOW_TILE_M - 0.5 * _SNOW_TILE_M
-    p_cam = p_dock @ T_dock_cam[:3, :3]
+    camera_m = view.T_dock_cam[:3, 3]
+    apart = tile + np.array(knobs.drift_m_s) * view.t_s - camera_m
+    apart = (apart + 0.5 * _SNOW_TILE_M) % _SNOW_TILE_M - 0.5 * _SNOW_TILE_M
+    p_cam = apart @ view.T_dock_cam[:3, :3]
     close = (p_cam[:, 2] > _NEAREST_M) & (p_cam[:, 2] < knobs.reach_m)
+    close[close] = view.lens.camera.contains(view.lens.project(p_cam[close]))
     p_cam, radius = p_cam[close], radius[close]
-    shown = lens.camera.contains(lens.project(p_cam))
-    p_cam, radius = p_cam[shown], radius[shown]
-    light = daylight_w_m2(scenario, camera_m[1])[None] * np.ones((len(p_cam), 1))
+    light = np.broadcast_to(daylight_w_m2(scenario, float(camera_m[1])), p_cam.shape)
     if scenario.around.headlamp is not None:
         light = light + headlamp_w_m2(scenario, scenario.around.headlamp, p_cam)
     watt_sr = light * knobs.albedo * radius[:, None] ** 2  # a diffuse sphere's mean, A / pi of its cross section
-    return emitters("snow", lens, p_cam, watt_sr, radius, exposure_s, halo=0.0)
+    return emitters("snow", view, p_cam, watt_sr, radius, halo=0.0)
 
 
 def headlamp_w_m2(scenario: Scenario, knobs: Headlamp, p_cam: Array) -> Array:
@@ -196,10 +165,9 @@ def headlamp_sr(scenario: Scenario, knobs: Headlamp, rays: Array) -> Array:
     return total
 
 
-def add_background(
-    canvas: Canvas, scenario: Scenario, T_dock_cam: Array, exposure_s: float, lamp_sr: Array | None
-) -> None:
+def add_background(canvas: Canvas, scenario: Scenario, view: View, lamp_sr: Array | None) -> None:
     """Add the water's own light: daylight and, from `lamp_sr` (h, w, 3), that of the vehicle's lamp."""
+    T_dock_cam = view.T_dock_cam
     sr = daylight_sr(scenario, T_dock_cam[:3, :3], float(T_dock_cam[1, 3]), canvas.wide_rays)
     sr = sr if lamp_sr is None else sr + lamp_sr
-    canvas.add_background(sr * (canvas.lens.aperture_m2 * exposure_s / PHOTON_J))
+    canvas.add_background(sr * (canvas.lens.aperture_m2 * view.exposure_s / PHOTON_J))

@@ -14,13 +14,13 @@ from lumidock.sim import around
 from lumidock.sim.canvas import Canvas, Core, Mosaic
 from lumidock.sim.knobs import Fish, Surface
 from lumidock.sim.lens import Lens
-from lumidock.sim.optics import PHOTON_J, Emitters, joined, lamp_watts, lamps, on_share
+from lumidock.sim.optics import PHOTON_J, Emitters, View, joined, lamp_watts, lamps, on_share
 from lumidock.sim.scenario import Scenario
 from lumidock.sim.sensor import electrons_per_level, hot_pixels, picture, read_out, saturation_e
 from lumidock.sim.water import absorption_scattering, green_index, phase_kind
 from lumidock.station import Station
 
-_HULL_ALBEDO = 0.05
+_BODY_ALBEDO = 0.1
 _TWILIGHT = 0.3  # light on a body's side over that from above
 
 
@@ -81,7 +81,7 @@ class Studio:
         self.canvas.clear()
         seen = self._emitters(moment)
         cores = self.canvas.add(seen, self._smear(moment, seen))
-        around.add_background(self.canvas, self.scenario, moment.T_dock_cam, moment.exposure_s, self.lamp_sr)
+        around.add_background(self.canvas, self.scenario, self._view(moment), self.lamp_sr)
         electrons = self.canvas.expected()
         self._occlude(moment, electrons, cores)
         rows, columns = self.hot_at
@@ -92,32 +92,28 @@ class Studio:
         """The picture of a shot, with its noise."""
         return picture(read_out(shot.electrons, self.scenario.sensor, rng), self.scenario.sensor, self.scenario.output)
 
+    def _view(self, moment: Moment) -> View:
+        return View(self.lens, moment.T_dock_cam, moment.exposure_s, moment.t_s)
+
     def _emitters(self, moment: Moment) -> Emitters:
         """Everything that shines; the station's lamps first."""
-        scenario, station, lens, knobs = self.scenario, self.station, self.lens, self.scenario.around
-        pwm = scenario.lamps
-        duty = on_share(pwm.pwm_hz, pwm.pwm_duty, moment.t_s, moment.exposure_s)
+        scenario, station, knobs, view = self.scenario, self.station, self.scenario.around, self._view(moment)
+        p_dock, radius_m = moment.p_dock, scenario.lamps.window_radius_m
+        duty = on_share(scenario.lamps.pwm_hz, scenario.lamps.pwm_duty, moment.t_s, moment.exposure_s)
         watts = lamp_watts(scenario, station, moment.transmission, duty)
-        own = lamps(scenario, lens, station, moment.p_dock, watts, moment.T_dock_cam, moment.exposure_s)
-        dark = np.zeros(len(station), bool)
-        dark[moment.dark] = True
-        parts = [replace(own, lit=own.lit & ~dark & moment.dock)]
-        watts = np.where(dark[:, None], 0.0, watts)
-        pose, radius = moment.T_dock_cam, scenario.lamps.window_radius_m
+        own = lamps(view, station, p_dock, watts, radius_m)
+        shining = ~np.isin(np.arange(len(station)), moment.dark)
+        parts = [replace(own, lit=own.lit & shining & moment.dock)]
+        watts = watts * shining[:, None]
         if moment.surface is not None:
-            n = green_index(scenario.water)
-            rng = moment.rng(11)
-            parts += around.mirrored(
-                moment.surface, lens, station, moment.p_dock, watts, pose, radius, moment.exposure_s, moment.t_s, rng, n
-            )
+            n, rng = green_index(scenario.water), moment.rng(11)
+            parts += around.mirrored(moment.surface, n, view, station, p_dock, watts, radius_m, rng)
         if knobs.glints is not None and moment.dock:
-            rng = moment.rng(12)
-            parts.append(around.glints(knobs.glints, lens, station, moment.p_dock, watts, pose, moment.exposure_s, rng))
+            parts.append(around.glints(knobs.glints, view, station, p_dock, watts, moment.rng(12)))
         if knobs.vehicle is not None:
-            parts.append(around.vehicle(knobs.vehicle, lens, pose, radius, moment.exposure_s, moment.t_s))
+            parts.append(around.vehicle(knobs.vehicle, view, radius_m))
         if knobs.snow is not None:
-            rng = moment.rng(13)
-            parts.append(around.snow(knobs.snow, scenario, lens, pose, moment.exposure_s, moment.t_s, rng))
+            parts.append(around.snow(knobs.snow, scenario, view, moment.rng(13)))
         if len(moment.strays):
             parts.append(_strays(own, moment.strays))
         return joined(parts)
@@ -159,8 +155,7 @@ class Studio:
             cv2.ellipse(mask, (camera.width // 2, camera.height), (across, up), 0.0, 0.0, 360.0, 255, -1, cv2.LINE_AA)
         clear = np.float32(1.0) - mask * np.float32(1.0 / 255.0)
         day = around.daylight_w_m2(self.scenario, float(moment.T_dock_cam[1, 3])) * _TWILIGHT
-        albedo = knobs.fish.albedo if knobs.fish is not None else _HULL_ALBEDO
-        photons = day * albedo / np.pi * (self.lens.aperture_m2 * moment.exposure_s / PHOTON_J)
+        photons = day * _BODY_ALBEDO / np.pi * (self.lens.aperture_m2 * moment.exposure_s / PHOTON_J)
         body = self.canvas.colors.qe @ photons * float(self.lens.solid_angle(camera.center_px[None])[0])
         electrons *= clear
         step = self.canvas.colors.step

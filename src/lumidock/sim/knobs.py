@@ -140,7 +140,6 @@ class Fish(Section):
     length_m: Lengths = (0.2, 0.5)
     distance_m: Lengths = (1.5, 4.0)  # from the camera
     speed_m_s: Lengths = (0.2, 0.6)
-    albedo: Probability = 0.15
 
 
 class Around(Section):
@@ -158,10 +157,16 @@ class Around(Section):
 class Port(Section):
     """A flat window before a lens calibrated in air; its axis is the lens's."""
 
-    gap_m: NonNegativeFloat = 0.02  # from the entrance pupil to the glass
-    glass_m: NonNegativeFloat = 0.01
+    gap_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.02  # from the entrance pupil to the glass
+    glass_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.01
     glass_index: Annotated[float, Field(ge=1.0, le=2.5)] = 1.50
     calibrated_at_m: Lengths = (1.5, 6.0)  # distances of the in-water calibration that camera.yaml holds
+
+    @model_validator(mode="after")
+    def _boards_are_in_the_water(self) -> Self:
+        if self.calibrated_at_m[0] < self.gap_m + self.glass_m + 0.1:
+            raise ValueError("calibrated_at_m: wanted at least 0.1 m beyond the glass")
+        return self
 
 
 class Lens(Section):

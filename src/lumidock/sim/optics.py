@@ -26,6 +26,20 @@ SPECTRUM = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """From where, when and how long is looked: pose `T_dock_cam` (4, 4), `t_s` since the start, `exposure_s`."""
+
+    lens: Lens
+    T_dock_cam: Array
+    exposure_s: float
+    t_s: float = 0.0
+
+    def p_cam(self, p_dock: Array) -> Array:
+        """Points (N, 3) of the dock as the camera has them."""
+        return transform_points(se3_inverse(self.T_dock_cam), p_dock)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Emitters:
     """N small bright things in one frame.
 
@@ -66,23 +80,20 @@ def intensity(power_w: Array, beam_deg: Array, cosine: Array) -> Array:
 
 def emitters(
     kind: str,
-    lens: Lens,
+    view: View,
     p_cam: Array,
     watt_sr: Array,
     radius_m: Array | float,
-    exposure_s: float,
     *,
-    range_m: Array | None = None,
     core: Array | float = 1.0,
     halo: Array | float = 1.0,
 ) -> Emitters:
     """Emitters at `p_cam` (N, 3) with intensities `watt_sr` (N, 3) in each band toward the camera."""
-    distance = np.maximum(np.linalg.norm(p_cam, axis=1), 1e-3)
-    range_m = distance if range_m is None else range_m
+    lens, distance = view.lens, np.maximum(np.linalg.norm(p_cam, axis=1), 1e-3)
     uv = lens.project(p_cam)
     lit = lens.camera.contains(uv) & (watt_sr.sum(axis=1) > 0.0)
     at = np.where(lit[:, None], uv, lens.camera.center_px)
-    photons = watt_sr / range_m[:, None] ** 2 * lens.aperture_m2 * exposure_s / PHOTON_J
+    photons = watt_sr / distance[:, None] ** 2 * lens.aperture_m2 * view.exposure_s / PHOTON_J
     pupil = np.sqrt(lens.aperture_m2 / np.pi)  # focused far away: what is near is blurred to the size of the pupil
     size = np.hypot(radius_m, pupil) / distance / np.sqrt(lens.solid_angle(at))
     return Emitters(
@@ -90,7 +101,7 @@ def emitters(
         p_cam,
         uv,
         photons * lens.throughput(at)[:, None],
-        range_m,
+        distance,
         size,
         np.broadcast_to(np.asarray(core, float), len(p_cam)),
         np.broadcast_to(np.asarray(halo, float), len(p_cam)),
@@ -133,11 +144,8 @@ def on_share(pwm_hz: float, duty: float, start_s: float, exposure_s: float) -> f
     return (on_until(start_s + exposure_s) - on_until(start_s)) / exposure_s
 
 
-def lamps(
-    scenario: Scenario, lens: Lens, station: Station, p_dock: Array, watts: Array, T_dock_cam: Array, exposure_s: float
-) -> Emitters:
-    """The station's M lamps, at `p_dock` (M, 3) and with `watts` (M, 3), from one pose."""
-    cosine = emission_cosine(p_dock, station.axis, T_dock_cam[:3, 3])
+def lamps(view: View, station: Station, p_dock: Array, watts: Array, radius_m: float) -> Emitters:
+    """The station's M lamps, which stand at `p_dock` (M, 3) and have `watts` (M, 3) in each band."""
+    cosine = emission_cosine(p_dock, station.axis, view.T_dock_cam[:3, 3])
     watt_sr = intensity(np.ones(len(watts)), station.beam_deg, cosine)[:, None] * watts
-    p_cam = transform_points(se3_inverse(T_dock_cam), p_dock)
-    return emitters("lamp", lens, p_cam, watt_sr, scenario.lamps.window_radius_m, exposure_s)
+    return emitters("lamp", view, view.p_cam(p_dock), watt_sr, radius_m)

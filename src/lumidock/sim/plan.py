@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -38,17 +38,20 @@ class Plan:
     world: World
     strays: Array
     exposure_s: Array
+    _studio: dict[int, Studio] = field(default_factory=dict, init=False)
 
     def __len__(self) -> int:
         return len(self.course.t_ns)
 
     def studio(self, number: int) -> Studio:
-        """What draws the frame: the lens as it really is in its run."""
+        """What draws the frame: the lens as it really is in its run. That of the last run is kept."""
         run = int(self.course.run[number])
-        n = green_index(self.scenario.water)
-        focal, center = float(self.world.focal[run]) - self.scenario.lens.focal_error, self.world.center_px[run]
-        lens = Lens.of(self.scenario.lens, self.camera, n, focal, center)
-        return Studio(self.scenario, self.station, lens, (self.seed, run))
+        if run not in self._studio:
+            focal, center = float(self.world.focal[run]) - self.scenario.lens.focal_error, self.world.center_px[run]
+            lens = Lens.of(self.scenario.lens, self.camera, green_index(self.scenario.water), focal, center)
+            self._studio.clear()
+            self._studio[run] = Studio(self.scenario, self.station, lens, (self.seed, run))
+        return self._studio[run]
 
     def moment(self, number: int) -> Moment:
         """What decides the frame."""

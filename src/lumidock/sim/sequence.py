@@ -96,16 +96,19 @@ def write_rendered(
     rows = rows_of(scenario.stream, plan.course.t_ns, np.random.default_rng([seed, 6]))
     if not rows:
         raise InputError(f"{scenario.name}: every frame is dropped")
+    if video and scenario.output.pixels not in ("bgr8", "mono8"):
+        raise InputError(f"output.pixels: a video holds bgr8 or mono8, not {scenario.output.pixels}")
     (out / "frames").mkdir(parents=True, exist_ok=True)
     control = scenario.sensor.auto_exposure
-    total = len(rows) + (len(plan) if control else 0)
+    once = list({row.number: row for row in reversed(rows)}.values())[::-1]  # a doubled row has one file
+    total = len(once) + (len(plan) if control else 0)
     with _mapping(workers or os.cpu_count() or 1) as mapping:
         if control:
             light = _counted(mapping(partial(metered, plan), range(len(plan))), progress, 0, total)
             plan = replace(plan, exposure_s=controlled(plan, control, light))
         job = partial(_write_frame, plan, out)
-        written = _counted(mapping(job, rows), progress, total - len(rows), total)
-    _write_truth(plan, rows, written, out)
+        written = _counted(mapping(job, once), progress, total - len(once), total)
+    _write_truth(plan, rows, dict(zip(once, written, strict=True)), out)
     if video:
         _into_video(rows, out, scenario)
     return len(rows)
@@ -174,7 +177,7 @@ def _truth_of(studio: Studio, shot: Shot, lost: bool) -> _Written:
     return _Written(lights, spurious)
 
 
-def _write_truth(plan: Plan, rows: list[Row], written: list[_Written], out: Path) -> None:
+def _write_truth(plan: Plan, rows: list[Row], written: dict[Row, _Written], out: Path) -> None:
     """Calibration, stamps and truth, a row for each frame of the sequence."""
     scenario = plan.scenario
     lens = plan.studio(0).lens
@@ -183,11 +186,11 @@ def _write_truth(plan: Plan, rows: list[Row], written: list[_Written], out: Path
     columns = ("frame", "file", "t_ns", *(("encoding",) if raw else ()))
     encoding = [f"bayer_{scenario.output.pattern}{scenario.output.pixels.removeprefix('bayer')}"] if raw else []
     _write_csv(out / "timestamps.csv", columns, ([r.name, _file_of(r, scenario), r.t_ns, *encoding] for r in rows))
-    once = {row.number: (row, truth) for row, truth in zip(rows, written, strict=True)}  # a doubled row has one truth
-    names = [row.name for row, _ in once.values()]
-    _write_poses(out, names, [row.t_ns for row, _ in once.values()], plan.course.T_dock_cam[list(once)])
-    _write_lights_truth(out, names, [truth.lights for _, truth in once.values()])
-    _write_spurious(out, names, [truth.spurious for _, truth in once.values()])
+    names = [row.name for row in written]
+    poses = plan.course.T_dock_cam[[row.number for row in written]]
+    _write_poses(out, names, [row.t_ns for row in written], poses)
+    _write_lights_truth(out, names, [truth.lights for truth in written.values()])
+    _write_spurious(out, names, [truth.spurious for truth in written.values()])
     if any(row.fault for row in rows):
         _write_csv(out / "stream_truth.csv", ("frame", "fault"), ([r.name, r.fault] for r in rows if r.fault))
 
