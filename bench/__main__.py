@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from bench import contact_sheet, doors, images, speed, table1, visibility
+from bench import contact_sheet, doors, images, rendering, speed, table1, visibility
 
 BENCHES = {
     "doors": doors,
@@ -19,6 +19,7 @@ BENCHES = {
     "images": images,
     "speed": speed,
     "visibility": visibility,
+    "rendering": rendering,
     "contact-sheet": contact_sheet,
 }
 
