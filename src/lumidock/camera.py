@@ -189,20 +189,26 @@ def _distort_rational(p_cam: Array, distortion: Array, fold: float) -> tuple[Arr
 
 
 def _undistort_rational(xy_distorted: Array, distortion: Array, fold: float) -> Array:
-    """Newton's method on the analytic Jacobian, kept inside the fold; NaN where it does not arrive."""
-    xy = _shorten(xy_distorted.copy(), fold)
+    """Newton's method on the analytic Jacobian, kept inside the fold; NaN where it does not arrive.
+
+    A step that does not come nearer is halved: within the fold the map is the gradient of a convex function.
+    """
+    xy, share = _shorten(xy_distorted.copy(), fold), np.ones(len(xy_distorted))
     with np.errstate(all="ignore"):  # a step that leaves the model is a NaN, and a NaN is the answer
+        out, J = _distort_xy(xy, distortion)
+        error = out - xy_distorted
         for _ in range(_NEWTON_STEPS):
-            out, J = _distort_xy(xy, distortion)
-            error = out - xy_distorted
             if np.all(np.abs(error) < _NEWTON_TOLERANCE):
                 break
             det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
             step_x = (J[:, 1, 1] * error[:, 0] - J[:, 0, 1] * error[:, 1]) / det
             step_y = (J[:, 0, 0] * error[:, 1] - J[:, 1, 0] * error[:, 0]) / det
-            xy = _shorten(xy - np.stack([step_x, step_y], 1), fold)
-        residual = np.abs(_distort_xy(xy, distortion)[0] - xy_distorted).max(axis=1)
-    xy[~(residual < _NEWTON_ACCEPTED)] = np.nan
+            tried = _shorten(xy - share[:, None] * np.stack([step_x, step_y], 1), fold)
+            out, J_tried = _distort_xy(tried, distortion)
+            nearer = np.linalg.norm(out - xy_distorted, axis=1) < np.linalg.norm(error, axis=1)
+            share = np.where(nearer, 1.0, 0.5 * share)
+            xy[nearer], J[nearer], error[nearer] = tried[nearer], J_tried[nearer], (out - xy_distorted)[nearer]
+    xy[~(np.abs(error).max(axis=1) < _NEWTON_ACCEPTED)] = np.nan
     ray = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
     return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
 
