@@ -21,6 +21,8 @@ Count = Annotated[int, Field(ge=0, le=1000)]
 Triple = tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Angle = Annotated[float, Field(ge=0.0, le=180.0)]
+Coefficient = Annotated[float, Field(ge=0.0, le=20.0)]
+Coefficients = tuple[Coefficient, Coefficient, Coefficient]
 Place = tuple[Distance, Distance, Distance]
 
 
@@ -54,10 +56,10 @@ class Water(Section):
     kind: Literal["pure-sea", "IB", "II", "III", "1C", "3C", "5C", "7C", "pool-clear", "pool-murky"] = (
         "III"  # Jerlov types and pools
     )
-    b_factor: Annotated[float, Field(ge=0.0, le=100.0)] = 1.0  # published b values differ by factors: sweep it
+    b_factor: Annotated[float, Field(ge=0.0, le=20.0)] = 1.0  # published b values differ by factors: sweep it
     phase: Literal["auto", "clear", "coastal", "harbour"] = "auto"  # Petzold's waters; auto is by kind
-    absorption: Triple | None = None  # 1/m at 455, 530, 610 nm, in place of the kind's
-    scattering: Triple | None = None
+    absorption: Coefficients | None = None  # 1/m at 455, 530, 610 nm, in place of the kind's
+    scattering: Coefficients | None = None
     salinity_psu: Annotated[float, Field(ge=0.0, le=45.0)] = 35.0
     temperature_c: Annotated[float, Field(ge=-2.0, le=40.0)] = 15.0
 
@@ -74,7 +76,7 @@ class Daylight(Section):
 class Lamps(Section):
     """The dock's own lamps."""
 
-    window_radius_m: PositiveFloat = 0.0175  # 15-20 mm
+    window_radius_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.0175  # 15-20 mm
     layers: Literal["all", "front", "rear"] = "all"  # which of them shine; rear is all but the first seen
     dim: Probability = 1.0  # share of their power
     fouling: Shares = (1.0, 1.0)  # transmission of each lamp's window, drawn for a run

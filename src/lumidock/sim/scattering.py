@@ -121,7 +121,7 @@ def _path_spectrum(kind: str) -> tuple[Array, Array]:
     spectrum = 2.0 * np.pi * _hankel(np.where(theta < np.pi, flat, 0.0), coarse)
     fine = np.interp(np.log(k), np.log(coarse), spectrum)
     sums = np.concatenate([[0.0], np.cumsum(0.5 * (fine[1:] + fine[:-1]) * np.diff(k))])
-    return k, (fine[0] * k[0] + sums) / k
+    return k, np.minimum((fine[0] * k[0] + sums) / k, 1.0)
 
 
 @lru_cache(maxsize=4096)
@@ -133,9 +133,13 @@ def halo(a: float, b: float, kind: str, distance_m: float, blur_rad: float = 0.0
     Source: W. Wells, J. Opt. Soc. Am. 59, 1969 and AGARD LS-61, 1973; C. Mobley, Light and Water, 1994.
     """
     k, path = _path_spectrum(kind)
-    depth = b * distance_m
+    depth, once = b * distance_m, b * distance_m * path
     beam = np.exp(-(a + b) * distance_m)
-    many = beam * (np.expm1(depth * path) - depth * path) * np.exp(-0.5 * (k * blur_rad) ** 2)
+    few, far = (
+        beam * (np.expm1(np.minimum(once, 1.0)) - once),
+        np.exp(once - depth - a * distance_m) - beam * (1.0 + once),
+    )
+    many = np.where(once < 1.0, few, far) * np.exp(-0.5 * (k * blur_rad) ** 2)
     theta = _HALO_RAD
     return theta, np.maximum(_hankel(many, theta) / (2.0 * np.pi), 0.0) + _single(a, b, kind, distance_m, blur_rad)
 
@@ -146,7 +150,7 @@ def _single(a: float, b: float, kind: str, distance_m: float, blur_rad: float) -
     The scattering angle alpha runs from theta to pi along the line of sight.
     """
     share = np.linspace(0.0, 1.0, _ANGLES_OF_ARC)[None, :]
-    theta = np.hypot(_HALO_RAD, 0.7 * blur_rad)[:, None]  # the blur flattens the peak at the lamp
+    theta = np.minimum(np.hypot(_HALO_RAD, 0.7 * blur_rad), 1.5)[:, None]  # the blur flattens the peak at the lamp
     alpha = theta * (np.pi / theta) ** share
     sight = distance_m * (np.cos(theta) - np.sin(theta) / np.tan(np.maximum(alpha, theta)))
     rest = distance_m * np.sin(theta) / np.maximum(np.sin(alpha), 1e-12)
