@@ -180,7 +180,7 @@ class Lens(Section):
     falloff: Probability = 0.1  # loss at the corner beyond the cosine law
     glare: Probability = 0.01  # share of all light that the lens scatters, about 1 %
     glare_px: PositiveFloat = 60.0  # half of it within about twice this
-    ghost: Probability = 1e-4  # share that is mirrored about the centre
+    ghost: Probability = 1e-5  # share that is mirrored about the centre: two reflections of 0.3 %
     ghost_px: PositiveFloat = 40.0  # radius of that
     port: Port | None = None
     focal_error: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0  # the true focal length over camera.yaml's, less one
