@@ -134,24 +134,21 @@ class PaperConfig(Section):
 class DetectConfig(Section):
     """Light detection of the default method; figures without a source were set on rendered approaches."""
 
-    pixel_contrast: PositiveFloat = 5.0  # sigmas by which a tile's largest pixel must clear its background ...
-    contrast: PositiveFloat = 2.0  # ... and the 3 x 3 mean around it, or the tile's, its own ring
+    contrast: PositiveFloat = 1.9  # sigmas by which a tile's largest pixel must clear that of the tiles around
     min_snr: PositiveFloat = 7.8  # of a spot; a small one's is that of a matched filter, in whose place noise reaches 7
-    min_noise: PositiveFloat = 0.7  # grey levels; rounding alone leaves 0.3
-    tile_step: PositiveFloat = 2.0  # grey levels that count as one sigma between tiles, where noise averages out
+    min_noise: PositiveFloat = 0.7  # steps of the sensor; rounding alone leaves 0.3
     ring_px: PositiveFloat = 8.0  # radius of the ring that is a small spot's background; larger spots take 3 radii
     max_spots: PositiveInt = 100  # in a frame; the strongest are kept
-    max_candidates: PositiveInt = 6000  # tiles looked at in a frame, the strongest first
+    max_candidates: PositiveInt = 1500  # tiles looked at in a frame, the most outstanding ...
+    max_measured: PositiveInt = 300  # ... and those of them that are worth a measurement, the brightest
     max_radius: Fraction = 0.06  # of the picture's longer side
     min_radius_px: PositiveFloat = 0.9  # no lens makes a smaller spot
-    max_work_px: PositiveInt = 1_500_000  # pixels looked at in all spots of a frame
-    small_px: PositiveFloat = 8.0  # up to this radius the centre comes from a Gaussian window
+    small_px: PositiveFloat = 3.2  # up to this radius the centre comes from the fit of a Gaussian
     min_elongation: Fraction = 0.6  # shorter over longer axis of a round spot; below, its level is raised
     min_fill: Fraction = 0.85  # area over that of the ellipse with the same moments
     signal_noise: PositiveFloat = 0.05  # variance of a pixel per grey level of signal: shot noise, mosaic, JPEG
     floor_px: PositiveFloat = 0.03  # 1 sigma of a centre that has no noise
-    coarse_px: PositiveFloat = 0.06  # the same where blue or red is brightest, and of saturated cores in mono
-    saturated_px: PositiveFloat = 0.04  # added to either, squared, where the core is saturated
+    saturated_px: PositiveFloat = 0.04  # added to it, squared, where the core is saturated
     cut: Fraction = 0.3  # 1 sigma, of the radius, of a centre whose spot the picture's edge cuts
     glint_radii: PositiveFloat = 3.6  # a spot this near, in radii of the stronger one, ...
     glint_ratio: PositiveFloat = 2.2  # ... with this many times less flux is a glint, ...

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
-Image = NDArray[np.uint8]
+Image = NDArray[Any]  # uint8 or uint16
 Indices = NDArray[np.int64]
 
 Status = Literal["none", "acquired", "tracking", "coasting"]
 Stage = Literal["search", "front", "transition", "rear"]
+MOSAICS = ("bayer_rggb", "bayer_bggr", "bayer_grbg", "bayer_gbrg")
 MatchSource = Literal["pso", "btekf"]
 
 
@@ -45,17 +46,27 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One picture: `image` (H, W) mono8 or (H, W, 3) bgr8, exposed at `t_ns`; `name` as its source calls it."""
+    """One picture as the camera gives it, exposed at `t_ns`; `name` as its source calls it.
+
+    `image` (H, W) mono or raw mosaic, or (H, W, 3) BGR, of 8 or 16 bits; 16 bits use their full scale. `encoding` as ROS
+    calls it; empty for mono or BGR by shape, `bayer_rggb8`, `bayer_grbg16` and so on for a mosaic, whose letters are the
+    first two pixels of the first two rows.
+    """
 
     name: str
     t_ns: int
     image: Image
     attitude: Attitude | None = None
+    encoding: str = ""
 
     def __post_init__(self) -> None:
-        if self.image.dtype != np.uint8:
-            raise ValueError(f"image is {self.image.dtype}, wanted uint8")
+        if self.image.dtype not in (np.uint8, np.uint16):
+            raise ValueError(f"image is {self.image.dtype}, wanted uint8 or uint16")
         require_shape("image", self.image, *((None, None) if self.image.ndim == 2 else (None, None, 3)))
+        bits = 8 * self.image.dtype.itemsize
+        fitting = [f"mono{bits}", *(f"{order}{bits}" for order in MOSAICS)] if self.image.ndim == 2 else [f"bgr{bits}"]
+        if self.encoding and self.encoding not in fitting:
+            raise ValueError(f"encoding {self.encoding!r} does not fit, wanted one of {', '.join(fitting)}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,554 +1,439 @@
-"""The hot loops of the detector: plain arrays in, plain arrays out, compiled by numba.
+"""The search of the detector: candidate tiles in order of strength, each measured in its own window.
 
-Pictures come as (H, W, C) uint8 of 1 or 3 channels; a pixel's value is that of its largest channel.
+What is found goes to rows of `spots`; the columns are named here. Lengths in pixels, values in 8-bit grey levels.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from lumidock._kernels import patch, tiles
+from lumidock._kernels.patch import Window
 from lumidock.datatypes import Array, Image, Indices
 
-TILE_PX = 8
-# columns of a measured spot, see `measure`
-U, V, RADIUS, FLUX, SNR, ELONGATION, FILL, LEVEL, SATURATED, CUT, COARSE, VAR_UU, VAR_UV, VAR_VV = range(14)
-COLUMNS = 14
-_SATURATED = 250
-_TILE_RINGS = (4.0, 12.0)
+U, V, RADIUS, FLUX, SNR, ELONGATION, FILL, LEVEL, SATURATED, CUT, HALO, P_LIGHT, VAR_UU, VAR_UV, VAR_VV = range(15)
+COLUMNS = 15
+# what may be tuned, see `DetectConfig`
+(
+    CONTRAST,
+    MIN_SNR,
+    RING_PX,
+    MAX_RADIUS_PX,
+    MIN_RADIUS_PX,
+    SMALL_PX,
+    MIN_ELONGATION,
+    MIN_FILL,
+    SIGNAL_NOISE,
+    FLOOR_PX,
+    SATURATED_PX,
+    CUT_SHARE,
+    GLINT_RADII,
+    GLINT_RATIO,
+    GLINT_TRUST,
+    CLIPPED,
+    MIN_NOISE,
+) = range(17)
 _LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out, until it is round and alone
-_COS, _SIN = np.cos(np.arange(24) * np.pi / 12.0), np.sin(np.arange(24) * np.pi / 12.0)
-_MARKS = len(_LEVELS) + 1  # one for each, and one to go back to the lowest
-_SETTLE_ROUNDS = 3
-_REFINE_ROUNDS = 8
-Work = tuple[NDArray[np.int32], Image, Indices]  # region of each pixel (H, W), regions of spots, stack (2, n)
-_FILTER_PX, _FILTERED_PX = 1.2, 3.0  # width of the window, and up to which radius it judges a spot
+_MAX_TILES = 20  # a light is not wider
+_FILTER_PX = 1.2  # width of the window that judges a small spot ...
+_FILTERED_PX = 3.0  # ... up to this radius
+_ROUNDS = 4
 
 
 @njit(cache=True)
-def tile_statistics(rows: Image, channels: int) -> tuple[Image, Array, Array]:
-    """Largest value, mean and variance (h, w) of each tile of the picture `rows` (H, W * channels).
+def search(
+    image: Image,
+    planes: int,
+    scale: float,
+    peak: Image,
+    level: Array,
+    sigma: Array,
+    shared: float,
+    rects: Indices,
+    most: tuple[int, int],
+    q: Array,
+    seen: Image,
+    found: Array,
+    spots: Array,
+) -> int:
+    """Write the spots of the tiles in `rects` (n, 4) to `spots` (N, COLUMNS), the strongest first; returns how many.
 
-    The largest value is of all pixels; mean and variance are of one even and one odd row, which hold every phase of a
-    Bayer mosaic.
+    `image` (H, W, C); `planes` 1, 3 or, for a mosaic, 4; `scale` makes 8-bit levels of its samples. `peak` (h, w) of
+    its tiles, `level` and `sigma` of its blocks in samples, see `tiles`. `most`: candidates and measurements.
     """
-    height, width = rows.shape[0], rows.shape[1] // channels
-    h, w = (height + TILE_PX - 1) // TILE_PX, (width + TILE_PX - 1) // TILE_PX
-    peak = np.zeros((h, w), np.uint8)
-    mean = np.zeros((h, w), np.float32)
-    variance = np.zeros((h, w), np.float32)
-    line = np.empty(rows.shape[1], np.uint8)
-    for i in range(h):
-        top, bottom = i * TILE_PX, min((i + 1) * TILE_PX, height)
-        line[:] = rows[top]
-        for v in range(top + 1, bottom):
-            _keep_larger(line, rows[v])
-        _tile_peaks(line, channels, peak[i])
-        even, odd = rows[min(top + 2, bottom - 1)], rows[min(top + 5, bottom - 1)]
-        _tile_moments(even, odd, channels, mean[i], variance[i])
-    return peak, mean, variance
+    seen[:] = 0
+    count = 0
+    clipped = q[CLIPPED] / scale
+    for k in range(len(rects)):
+        count += tiles.candidates(peak, level, sigma, q[CONTRAST], clipped, rects[k], seen, found[count:])
+    order = _strongest(peak, found, count, most[0])
+    seen[:] = 0  # from here on: tiles of spots
+    n, work = 0, most[1]
+    side = patch.SIDE + 16
+    window = (
+        np.empty((side, side)),
+        np.zeros((side, side), np.int16),
+        np.empty((side * side, 2), np.int32),
+        np.empty(12),
+    )
+    for k in order:
+        if n == len(spots) or work <= 0:
+            break
+        i, j = int(found[k, 0]), int(found[k, 1])
+        if seen[i, j]:
+            continue
+        noise = max(scale * sigma[i // tiles.BLOCK, j // tiles.BLOCK], q[MIN_NOISE])
+        base = scale * level[i // tiles.BLOCK, j // tiles.BLOCK]
+        status = _measure(image, planes, scale, peak, i, j, base, noise, shared, q, window, spots, n)
+        work -= status >= 0
+        if status > 0:
+            _own(seen, spots[n])
+            n += 1
+    for k in range(n):
+        spots[k, P_LIGHT] = _lamp_probability(spots[k], q)
+    _dim_glints(spots, n, q)
+    return n
 
 
 @njit(cache=True)
-def _keep_larger(line: Image, row: Image) -> None:
-    """Raise each element of `line` (n,) to that of `row` (n,)."""
-    for x in range(len(line)):
-        line[x] = max(line[x], row[x])
+def _strongest(peak: Image, found: Array, count: int, most: int) -> Indices:
+    """The candidates, brightest first and of those the most outstanding; of too many the most outstanding."""
+    if count > most:
+        least = np.sort(found[:count, 2])[count - most]
+        kept = 0
+        for k in range(count):
+            if found[k, 2] >= least and kept < most:
+                found[kept] = found[k]
+                kept += 1
+        count = kept
+    key = np.empty(count)
+    for k in range(count):
+        key[k] = -(float(peak[int(found[k, 0]), int(found[k, 1])]) + 1e-6 * min(found[k, 2], 1e5))
+    return np.argsort(key, kind="mergesort")
 
 
 @njit(cache=True)
-def _tile_peaks(line: Image, channels: int, peak: Image) -> None:
-    """Write the largest values of the tiles of `line` (W * channels) to `peak` (w,)."""
-    step = TILE_PX * channels
-    for j in range(len(peak)):
-        highest = np.uint8(0)
-        for x in range(j * step, min((j + 1) * step, len(line))):
-            highest = max(highest, line[x])
-        peak[j] = highest
+def _brightest(image: Image, i: int, j: int) -> tuple[int, int, bool]:
+    """Row and column of a tile's brightest pixel, and whether none beyond the tile's border next to it is brighter.
 
-
-@njit(cache=True)
-def _tile_moments(even: Image, odd: Image, channels: int, mean: Array, variance: Array) -> None:
-    """Write mean and variance of the tiles of two rows (W * channels) to `mean` and `variance` (w,)."""
-    width = len(even) // channels
-    for j in range(len(mean)):
-        low, high = j * TILE_PX, min((j + 1) * TILE_PX, width)
-        total, squares = np.int32(0), np.int32(0)
-        if channels == 1:
-            for u in range(low, high):
-                a, b = np.int32(even[u]), np.int32(odd[u])
-                total += a + b
-                squares += a * a + b * b
-        else:
-            for x in range(3 * low, 3 * high, 3):
-                a = np.int32(max(even[x], even[x + 1], even[x + 2]))
-                b = np.int32(max(odd[x], odd[x + 1], odd[x + 2]))
-                total += a + b
-                squares += a * a + b * b
-        count = 2.0 * (high - low)
-        mean[j] = total / count
-        variance[j] = max(squares / count - (total / count) ** 2, 0.0)
-
-
-@njit(cache=True)
-def _value(image: Image, v: int, u: int) -> int:
-    """Value of one pixel: its largest channel."""
-    if image.shape[2] == 1:
-        return int(image[v, u, 0])
-    return int(max(image[v, u, 0], image[v, u, 1], image[v, u, 2]))
-
-
-@njit(cache=True)
-def _mean_value(image: Image, v: int, u: int) -> int:
-    """Mean of the channels of one pixel: where the largest is saturated, it still tells a white core from its halo."""
-    if image.shape[2] == 1:
-        return int(image[v, u, 0])
-    return (int(image[v, u, 0]) + int(image[v, u, 1]) + int(image[v, u, 2])) // 3
-
-
-@njit(cache=True)
-def _read(image: Image, v: int, u: int, mean: bool) -> int:
-    """Mean or value of one pixel."""
-    return _mean_value(image, v, u) if mean else _value(image, v, u)
+    Pixels count by their largest channel, and among equals by the sum of all.
+    """
+    best, row, column = -1, 0, 0
+    top, left = i * tiles.TILE_PX, j * tiles.TILE_PX
+    for v in range(top, min(top + tiles.TILE_PX, image.shape[0])):
+        for u in range(left, min(left + tiles.TILE_PX, image.shape[1])):
+            rank = _rank(image, v, u)
+            if rank > best:
+                best, row, column = rank, v, u
+    for v in range(max(row - 1, 0), min(row + 2, image.shape[0])):
+        for u in range(max(column - 1, 0), min(column + 2, image.shape[1])):
+            if _rank(image, v, u) > best:
+                return row, column, False
+    return row, column, True
 
 
 @njit(cache=True)
 def _rank(image: Image, v: int, u: int) -> int:
-    """Order of brightness: by value, and by mean among equals."""
-    return 256 * _value(image, v, u) + _mean_value(image, v, u)
+    if image.shape[2] == 1:
+        return int(image[v, u, 0])
+    a, b, c = int(image[v, u, 0]), int(image[v, u, 1]), int(image[v, u, 2])
+    return 1024 * max(a, b, c) + a + b + c
 
 
 @njit(cache=True)
-def _ring_level(image: Image, u: float, v: float, radius: float, mean: bool) -> float:
-    """Mean of the middle half of the values on a circle; 0 where the circle is outside the picture."""
-    values = np.empty(len(_COS))
-    count = 0
-    for k in range(len(_COS)):
-        x, y = int(np.floor(u + radius * _COS[k] + 0.5)), int(np.floor(v + radius * _SIN[k] + 0.5))
-        if 0 <= x < image.shape[1] and 0 <= y < image.shape[0]:
-            count = _insert(values, count, _read(image, y, x, mean))
-    return _middle_mean(values, count)
+def _extent(peak: Image, i: int, j: int, base: float) -> float:
+    """Radius px that the tiles give a spot at half height: of its narrower side, half a tile at least."""
+    half = 0.5 * (float(peak[i, j]) + base)
+    width, height = 1, 1
+    for step in (-1, 1):
+        k = 1
+        while k < _MAX_TILES and 0 <= j + step * k < peak.shape[1] and peak[i, j + step * k] > half:
+            k += 1
+        width += k - 1
+        k = 1
+        while k < _MAX_TILES and 0 <= i + step * k < peak.shape[0] and peak[i + step * k, j] > half:
+            k += 1
+        height += k - 1
+    return 0.5 * tiles.TILE_PX * min(width, height)
 
 
 @njit(cache=True)
-def _tile_ring_median(mean: Array, i: int, j: int, radius: float) -> float:
-    """Median of the tile means on a circle of `radius` tiles; the own mean when the circle is outside the picture."""
-    values = np.empty(len(_COS))
-    count = 0
-    for k in range(len(_COS)):
-        x, y = int(np.floor(j + radius * _COS[k] + 0.5)), int(np.floor(i + radius * _SIN[k] + 0.5))
-        if 0 <= x < mean.shape[1] and 0 <= y < mean.shape[0]:
-            count = _insert(values, count, mean[y, x])
-    return float(values[count // 2] if count else mean[i, j])
+def _measure(
+    image: Image,
+    planes: int,
+    scale: float,
+    peak: Image,
+    i: int,
+    j: int,
+    base: float,
+    noise: float,
+    shared: float,
+    q: Array,
+    window: Window,
+    spots: Array,
+    n: int,
+) -> int:
+    """Measure the spot of one candidate tile into `spots[n]`: 1 if there is one, 0 if not, -1 if it was cheap to say so."""
+    v, u, alone = _brightest(image, i, j)
+    if not alone:
+        return -1
+    radius = _extent(peak, i, j, base / scale)
+    weight, where, start = np.zeros(4), np.zeros(5), np.zeros(2, np.int64)
+    share = patch.weigh(image, planes, scale, v, u, max(min(radius, q[MAX_RADIUS_PX]), 3.0), q[CLIPPED], weight)
+    reach = min(max(3.5 * radius, 1.5 * q[RING_PX]), 3.5 * q[MAX_RADIUS_PX])
+    part, floor = 0.0, 0.0
+    for turn in range(_ROUNDS):
+        patch.cut(image, planes, scale, weight, v, u, reach, window[0], where)
+        start[0], start[1] = _index(u, where[0], where[2], where[3]), _index(v, where[1], where[2], where[4])
+        ring = 0.9 * reach / where[patch.UNIT]
+        floor = patch.flatten(window[0], where, float(start[0]), float(start[1]), ring)
+        here = max(patch.rim_noise(window[0], where), 0.5 * noise * share, q[MIN_NOISE] * share)
+        if turn == 0 and radius <= tiles.TILE_PX:
+            width = _FILTER_PX / where[patch.UNIT]
+            snr = patch.filter_snr(window[0], where, float(start[0]), float(start[1]), max(width, 0.7), floor, here)
+            if snr < 0.7 * q[MIN_SNR] * np.sqrt(shared):
+                return -1 if turn == 0 else 0
+        noise = here
+        part = _level(image, planes, window, where, start, floor, q, spots, n)
+        sums = window[3]
+        if part == 0.0:
+            if reach >= 3.5 * q[MAX_RADIUS_PX] or sums[patch.OPEN] == 0.0:
+                return 0
+            reach = min(2.0 * reach, 3.5 * q[MAX_RADIUS_PX])
+            continue
+        found = np.sqrt(sums[patch.N] / np.pi) * where[patch.UNIT]
+        wanted = min(max(3.5 * found, 1.5 * q[RING_PX]), 3.5 * q[MAX_RADIUS_PX])
+        if 0.6 * reach <= wanted <= 1.25 * reach or turn == _ROUNDS - 1:
+            break
+        reach = wanted
+    if part == 0.0:
+        return 0
+    return int(_describe(image, planes, scale, weight, window, where, start, u, v, part, floor, noise, shared, q, spots, n))
 
 
 @njit(cache=True)
-def _middle_mean(values: Array, count: int) -> float:
-    """Mean of the middle half of the first `count` of the sorted `values`: as robust as a median, and finer."""
-    if count == 0:
-        return 0.0
-    skip = count // 4
-    return float(values[skip : count - skip].mean())
+def _index(x: int, first: float, unit: float, count: float) -> int:
+    """Sample of a window that holds pixel `x`."""
+    return min(int((x - first) / unit), int(count) - 1)
 
 
 @njit(cache=True)
-def _insert(values: Array, count: int, value: float) -> int:
-    """Insert into the first `count` of the sorted `values`; returns the new count."""
-    k = count
-    while k > 0 and values[k - 1] > value:
-        values[k] = values[k - 1]
-        k -= 1
-    values[k] = value
-    return count + 1
-
-
-@njit(cache=True)
-def _brightest(image: Image, i: int, j: int) -> tuple[int, int, int]:
-    """Row, column and rank of a tile's brightest pixel, the first of several."""
-    best, row, column = -1, 0, 0
-    for v in range(i * TILE_PX, min((i + 1) * TILE_PX, image.shape[0])):
-        for u in range(j * TILE_PX, min((j + 1) * TILE_PX, image.shape[1])):
-            rank = _rank(image, v, u)
-            if rank > best:
-                best, row, column = rank, v, u
-    return row, column, best
-
-
-@njit(cache=True)
-def _small_mean(image: Image, v: int, u: int) -> tuple[float, int]:
-    """Mean value and largest rank of the 3 x 3 pixels around one."""
-    total, count, highest = 0, 0, 0
-    for y in range(max(v - 1, 0), min(v + 2, image.shape[0])):
-        for x in range(max(u - 1, 0), min(u + 2, image.shape[1])):
-            total += _value(image, y, x)
-            count += 1
-            highest = max(highest, _rank(image, y, x))
-    return total / count, highest
-
-
-@njit(cache=True)
-def _is_tile_peak(mean: Array, i: int, j: int) -> bool:
-    """Whether no tile around has a larger mean."""
-    for b in range(max(i - 1, 0), min(i + 2, mean.shape[0])):
-        for a in range(max(j - 1, 0), min(j + 2, mean.shape[1])):
-            if mean[b, a] > mean[i, j]:
-                return False
-    return True
-
-
-@njit(cache=True)
-def _contrast(
-    image: Image, mean: Array, u: int, v: int, small: float, noise: float, ring_px: float, step: float
-) -> float:
-    """How far a peak stands out, in sigmas: the best of three scales, see `peaks`."""
-    best = (small - _ring_level(image, u, v, ring_px, False)) / noise
-    i, j = v // TILE_PX, u // TILE_PX
-    if small < _SATURATED and not _is_tile_peak(mean, i, j):  # noise on the halo of something larger
-        return best
-    for radius in _TILE_RINGS:
-        best = max(best, (mean[i, j] - _tile_ring_median(mean, i, j, radius)) / max(noise, step))
+def _peak_value(part: Array, where: Array, start: Indices) -> float:
+    """Largest sample around the start of a spot."""
+    best = -1e9
+    for y in range(max(start[1] - 1, 0), min(start[1] + 2, int(where[patch.ROWS]))):
+        for x in range(max(start[0] - 1, 0), min(start[0] + 2, int(where[patch.COLUMNS]))):
+            if part[y, x] > best:
+                best = part[y, x]
+                at_x, at_y = x, y
+    start[0], start[1] = at_x, at_y
     return best
 
 
 @njit(cache=True)
-def peaks(
-    image: Image,
-    mean: Array,
-    background: Array,
-    noise: Array,
-    tiles: Indices,
-    ring_px: float,
-    step: float,
-    least: float,
-) -> Array:
-    """Local maxima (n, 4), columns u, v, rank, contrast, of the `tiles` (N, 2) that stand out from their surroundings.
+def _level(
+    image: Image, planes: int, window: Window, where: Array, start: Indices, floor: float, q: Array, spots: Array, n: int
+) -> float:
+    """Grow the spot at the lowest share of its peak where it is round and alone, at the lowest where it is alone otherwise.
 
-    The contrast is the best of three scales, in sigmas: 3 x 3 pixels against a ring of `ring_px`, and a tile's mean
-    against rings of 4 and of 12 tiles, where `step` grey levels count as one sigma at least. `mean`, `background` and
-    `noise` (h, w) are of the tiles; `least` is the contrast wanted.
+    Returns the share, 0 where the spot is never alone. A saturated core in one plane is swollen at half height by its
+    halo, which no colour tells apart: there the lowest share is left out.
     """
-    found = np.empty((len(tiles), 4))
-    count = 0
-    for n in range(len(tiles)):
-        i, j = tiles[n]
-        v, u, rank = _brightest(image, i, j)
-        small, highest = _small_mean(image, v, u)
-        # the slope of something brighter in the next tile, or a lone pixel
-        if highest > rank or small - background[i, j] < least * noise[i, j]:
+    top = _peak_value(window[0], where, start)
+    window[1][:] = 0
+    first = 1 if planes == 1 and top >= q[CLIPPED] else 0
+    fallback = 0.0
+    if top <= floor:
+        return 0.0
+    for k in range(first, len(_LEVELS) + 1):
+        again = k == len(_LEVELS)
+        if again and fallback == 0.0:
+            return 0.0
+        share = fallback if again else _LEVELS[k]
+        patch.grow(
+            window, where, image, start[0], start[1], floor + share * (top - floor), q[CLIPPED], k + 1
+        )
+        sums = window[3]
+        if sums[patch.OPEN] > 0.0 or _holds_another(window[1], where, k + 1, spots, n):
             continue
-        contrast = _contrast(image, mean, u, v, small, noise[i, j], ring_px, step)
-        if contrast >= least:
-            found[count, 0], found[count, 1], found[count, 2], found[count, 3] = u, v, rank, contrast
-            count += 1
-    return found[:count]
-
-
-@njit(cache=True)
-def _add_run(
-    sums: Array, image: Image, v: int, low: int, high: int, start: tuple[int, int], level: float, mean: bool
-) -> None:
-    """Add the pixels `low` to `high`, exclusive, of row `v` to the sums of `_flood`."""
-    y, height, width = float(v - start[1]), image.shape[0], image.shape[1]
-    for u in range(low, high):
-        value = _read(image, v, u, mean)
-        x, weight = float(u - start[0]), value - level
-        sums[1] += x
-        sums[3] += x * x
-        sums[6] += weight
-        sums[7] += weight * x
-        sums[8] += weight * y
-        sums[9] += _value(image, v, u) >= _SATURATED
-    count, along = float(high - low), 0.5 * (low + high - 1) - start[0]
-    sums[0] += count
-    sums[2] += count * y
-    sums[4] += count * along * y
-    sums[5] += count * y * y
-    sums[10] += low == 0 or high == width or v == 0 or v == height - 1
-
-
-@njit(cache=True)
-def _flood(
-    image: Image,
-    work: Work,
-    mark: int,
-    start: tuple[int, int],
-    level: float,
-    most: int,
-    mean: bool,
-    sums: Array,
-) -> int:
-    """Sum up the connected pixels above `level` around `start` (u, v), run by run; returns their number.
-
-    `sums` becomes [n, u, v, uu, uv, vv, w, wu, wv, saturated, cut, failed], coordinates relative to `start`, weights
-    w = value - level, with the mean of the channels for value if `mean`. The pixels get `mark`. It fails where they
-    meet those of a spot already found or are more than `most`.
-    """
-    stamp, owned, stack = work
-    sums[:] = 0.0
-    height, width = image.shape[:2]
-    stack[0, 0], stack[1, 0] = start
-    top = 1
-    while top:
-        top -= 1
-        u, v = stack[0, top], stack[1, top]
-        if stamp[v, u] == mark:
-            continue
-        low, high = u, u + 1
-        while low > 0 and stamp[v, low - 1] != mark and _read(image, v, low - 1, mean) > level:
-            low -= 1
-        while high < width and stamp[v, high] != mark and _read(image, v, high, mean) > level:
-            high += 1
-        for x in range(low, high):
-            if owned[stamp[v, x]]:
-                sums[11] = 1.0
-                return int(sums[0])
-            stamp[v, x] = mark
-        _add_run(sums, image, v, low, high, start, level, mean)
-        if sums[0] > most:
-            sums[11] = 1.0
-            return int(sums[0])
-        for b in (v - 1, v + 1):
-            if b < 0 or b >= height:
-                continue
-            inside = False
-            for x in range(max(low - 1, 0), min(high + 1, width)):  # 8-connected
-                lit = stamp[b, x] != mark and _read(image, b, x, mean) > level
-                if lit and not inside and top < stack.shape[1]:
-                    stack[0, top], stack[1, top] = x, b
-                    top += 1
-                inside = lit
-    return int(sums[0])
-
-
-@njit(cache=True)
-def _shape(sums: Array) -> tuple[float, float]:
-    """Ratio of the axes of the ellipse with the region's second moments, and the region's area over the ellipse's."""
-    n = sums[0]
-    uu = (sums[3] - sums[1] ** 2 / n) / n + 1.0 / 12.0
-    vv = (sums[5] - sums[2] ** 2 / n) / n + 1.0 / 12.0
-    uv = (sums[4] - sums[1] * sums[2] / n) / n
-    half, turn = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
-    area = 4.0 * np.pi * np.sqrt(max(uu * vv - uv * uv, 1e-12))
-    return np.sqrt(max(half - turn, 1e-12) / (half + turn)), n / area
-
-
-@njit(cache=True)
-def _filter_snr(image: Image, center: Array, width: float, background: float, noise: float) -> float:
-    """Signal-to-noise ratio of what lies under a Gaussian window at `center` (2,)."""
-    reach = int(np.ceil(2.5 * width))
-    total, power = 0.0, 0.0
-    for y in range(max(int(center[1]) - reach, 0), min(int(center[1]) + reach + 2, image.shape[0])):
-        for x in range(max(int(center[0]) - reach, 0), min(int(center[0]) + reach + 2, image.shape[1])):
-            a, b = x - center[0], y - center[1]
-            window = np.exp(-0.5 * (a * a + b * b) / (width * width))
-            total += window * (_value(image, y, x) - background)
-            power += window * window
-    return float(total / (noise * np.sqrt(power)))
-
-
-@njit(cache=True)
-def _refine(image: Image, center: Array, radius: float, background: float, variance: float, cov: Array) -> bool:
-    """Move `center` (2,) to where a Gaussian window of the spot's own width balances; its noise goes to `cov` (3,).
-
-    False, and nothing changed, when it does not settle within a radius. Source: E. Bertin, SExtractor, windowed
-    positions.
-    """
-    width = max(radius / 1.18, 0.8)
-    reach = int(np.ceil(3.0 * width))
-    u, v = center
-    low_v, high_v = max(int(v) - reach, 0), min(int(v) + reach + 2, image.shape[0])
-    low_u, high_u = max(int(u) - reach, 0), min(int(u) + reach + 2, image.shape[1])
-    uu, uv, vv, total = 0.0, 0.0, 0.0, 0.0
-    for _ in range(_REFINE_ROUNDS):
-        total, du, dv, uu, uv, vv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for y in range(low_v, high_v):
-            for x in range(low_u, high_u):
-                a, b = x - u, y - v
-                window = np.exp(-0.5 * (a * a + b * b) / (width * width))
-                signal = window * (_value(image, y, x) - background)
-                total += signal
-                du += signal * a
-                dv += signal * b
-                uu += window * window * a * a
-                uv += window * window * a * b
-                vv += window * window * b * b
-        if total <= 0.0:
-            return False
-        u += 2.0 * du / total
-        v += 2.0 * dv / total
-        if np.hypot(u - center[0], v - center[1]) > max(radius, 1.0):
-            return False
-    center[0], center[1] = u, v
-    cov[0], cov[1], cov[2] = uu, uv, vv
-    cov *= 4.0 * variance / total**2
-    return True
-
-
-@njit(cache=True)
-def _is_coarse(image: Image, v: int, u: int) -> bool:
-    """Whether the spot at a pixel is seen coarsely.
-
-    So are blue and red, of which a mosaic and JPEG have fewer samples, and a saturated core in a mono picture, where
-    nothing tells it from its halo.
-    """
-    if image.shape[2] == 1:
-        return bool(image[v, u, 0] >= _SATURATED)
-    return bool(image[v, u, 1] < max(image[v, u, 0], image[v, u, 2]))
-
-
-@njit(cache=True)
-def _cut_out(
-    image: Image,
-    work: Work,
-    mark: int,
-    start: tuple[int, int],
-    peak: float,
-    background: float,
-    most: int,
-    mean: bool,
-    sums: Array,
-    roundness: Array,
-) -> tuple[float, int]:
-    """Cut a spot out at the lowest of `_LEVELS` where it is round and alone, at the lowest where it is alone otherwise.
-
-    Returns the level's share of the peak, 0 where the spot is never alone, and how many pixels were looked at.
-    `roundness` holds the least ratio of axes and the least fill; marks from `mark` on are used. A spot has at most
-    `most` pixels.
-    """
-    fallback, looked = 0.0, 0
-    clipped = (
-        image.shape[2] == 1 and peak >= _SATURATED
-    )  # at half height its halo swells it, which no colour tells apart
-    for k in range(1 if clipped else 0, len(_LEVELS)):
-        share = _LEVELS[k]
-        level = background + share * (peak - background)
-        looked += _flood(image, work, mark + k, start, level, most, mean, sums)
-        if sums[11] > 0.0:
-            continue
-        elongation, fill = _shape(sums)
-        if sums[0] < 12.0 or (elongation > roundness[0] and fill > roundness[1]):
-            return share, looked
+        elongation, fill = patch.shape(sums)
+        if again or sums[patch.N] < 12.0 or (elongation > q[MIN_ELONGATION] and fill > q[MIN_FILL]):
+            return share
         if fallback == 0.0:
             fallback = share
-    if fallback > 0.0:
-        level = background + fallback * (peak - background)
-        looked += _flood(image, work, mark + len(_LEVELS), start, level, most, mean, sums)
-    return fallback, looked
+    return 0.0
 
 
 @njit(cache=True)
-def _settle(
+def _holds_another(stamp: Array, where: Array, mark: int, spots: Array, n: int) -> bool:
+    """Whether the grown region covers the centre of a spot found before."""
+    for k in range(n):
+        x = int((spots[k, U] - where[patch.LEFT]) / where[patch.UNIT] + 0.5)
+        y = int((spots[k, V] - where[patch.TOP]) / where[patch.UNIT] + 0.5)
+        if 0 <= x < where[patch.COLUMNS] and 0 <= y < where[patch.ROWS] and stamp[y, x] == mark:
+            return True
+    return False
+
+
+@njit(cache=True)
+def _describe(
     image: Image,
-    work: Work,
-    mark: int,
-    start: tuple[int, int],
-    coarse: float,
-    largest: int,
-    ring_px: float,
-    roundness: Array,
-    sums: Array,
-) -> tuple[float, float, float, int]:
-    """Cut a spot out over the background of the ring around it, whose radius follows the spot's.
-
-    Returns the level's share of the peak, 0 where there is no spot, the level, the background and how many pixels were
-    looked at. `coarse` is the background of the wider surroundings, for spots that cover their first ring.
-    """
-    u0, v0 = start
-    mean = _value(image, v0, u0) >= _SATURATED
-    peak = float(_read(image, v0, u0, mean))
-    background, room = _ring_level(image, u0, v0, ring_px, mean), int(4.0 * np.pi * ring_px**2)
-    if background > 0.5 * (peak + coarse):
-        background, room = min(coarse, 0.5 * peak), largest
-    share, level, total = 0.0, 0.0, 0
-    for turn in range(_SETTLE_ROUNDS):
-        first = mark + turn * _MARKS
-        share, looked = _cut_out(image, work, first, start, peak, background, room, mean, sums, roundness)
-        total += looked
-        if share == 0.0:
-            if room == largest and work[0][v0, u0] > 0:  # too large for a light: nobody looks there again
-                work[1][work[0][v0, u0]] = 1
-            break
-        level = background + share * (peak - background)
-        reach = max(ring_px, 3.0 * np.sqrt(sums[0] / np.pi))
-        u, v = u0 + sums[1] / sums[0], v0 + sums[2] / sums[0]
-        rim, room = min(_ring_level(image, u, v, reach, mean), peak - 1.0), min(int(np.pi * reach**2), largest)
-        settled = abs(rim - background) < 0.05 * (peak - background)
-        background = rim
-        if settled:
-            break
-    return share, level, background, total
-
-
-@njit(cache=True)
-def _weigh(sums: Array, start: tuple[int, int], variance: float, center: Array, cov: Array) -> None:
-    """Write the weighted centre (2,) of a region and what noise of `variance` per pixel does to it, `cov` (3,)."""
-    x, y = sums[7] / sums[6], sums[8] / sums[6]
-    center[0], center[1] = start[0] + x, start[1] + y
-    cov[0] = sums[3] - 2.0 * x * sums[1] + sums[0] * x * x
-    cov[1] = sums[4] - x * sums[2] - y * sums[1] + sums[0] * x * y
-    cov[2] = sums[5] - 2.0 * y * sums[2] + sums[0] * y * y
-    cov *= variance / sums[6] ** 2
-
-
-@njit(cache=True)
-def measure(
-    image: Image,
-    found: Array,
-    noise: Array,
-    coarse: Array,
-    limits: tuple[int, int, int],
-    small_px: float,
-    ring_px: float,
-    roundness: Array,
-    signal_noise: float,
-    least: float,
-) -> Array:
-    """Spots (n, COLUMNS) around the peaks `found` (N, 4), which are ordered by strength.
-
-    `noise` and `coarse` (N,) are the noise and the background around each peak, `limits` the largest number of spots,
-    of pixels in one and of pixels looked at in all. Spots up to `small_px` of radius that are not saturated get their
-    centre from a Gaussian window. `signal_noise` is the variance of a pixel per grey level of signal, `least` the
-    signal-to-noise ratio wanted.
-    """
-    most, largest, budget = limits
-    stamp = np.zeros(image.shape[:2], np.int32)  # which region each pixel was last in
-    owned = np.zeros(1 + _SETTLE_ROUNDS * _MARKS * len(found), np.uint8)  # whether a region is a spot's
-    work = (stamp, owned, np.empty((2, largest), np.int64))
-    spots = np.empty((most, COLUMNS))
-    sums, center, cov = np.empty(12), np.empty(2), np.empty(3)
-    count = 0
-    for n in range(len(found)):
-        u0, v0 = int(found[n, 0]), int(found[n, 1])
-        if count == most or budget <= 0:
-            break
-        if owned[stamp[v0, u0]]:
-            continue
-        mark, start = 1 + n * _SETTLE_ROUNDS * _MARKS, (u0, v0)
-        share, level, background, looked = _settle(
-            image, work, mark, start, coarse[n], largest, ring_px, roundness, sums
+    planes: int,
+    scale: float,
+    weight: Array,
+    window: Window,
+    where: Array,
+    start: Indices,
+    u: int,
+    v: int,
+    share: float,
+    floor: float,
+    noise: float,
+    shared: float,
+    q: Array,
+    spots: Array,
+    n: int,
+) -> bool:
+    """Fill `spots[n]` from the grown region; False for what is too faint, or a spot that is there already."""
+    spot, sums = spots[n], window[3]
+    top = window[0][start[1], start[0]]
+    level = floor + share * (top - floor)
+    unit = where[patch.UNIT]
+    area = sums[patch.N]
+    radius = np.sqrt(area / np.pi) * unit
+    spot[HALO] = _around(window[0], where, start, sums, 2.0, floor) / max(top - floor, 1e-6)
+    flux = sums[patch.W] + area * (level - floor)
+    snr = flux / (np.sqrt(area) * noise)
+    if radius < _FILTERED_PX:
+        width = max(_FILTER_PX / unit, 0.7)
+        x, y = start[0] + sums[patch.X] / area, start[1] + sums[patch.Y] / area
+        snr = patch.filter_snr(window[0], where, x, y, width, floor, noise)
+    snr /= np.sqrt(shared)
+    if snr < q[MIN_SNR]:
+        return False
+    pitch = 2.0 if planes == 4 else 1.0
+    spot[RADIUS], spot[FLUX], spot[SNR], spot[LEVEL] = radius, flux * unit * unit, snr, share
+    spot[ELONGATION], spot[FILL] = patch.shape(sums)
+    spot[SATURATED], spot[CUT] = sums[patch.CLIPPED] / area, sums[patch.EDGE] / area
+    spread = _unresolved(sums, q, unit)
+    if unit > pitch:  # again, as finely as the room allows
+        patch.cut(image, planes, scale, weight, v, u, 1.6 * radius + 3.0, window[0], where)
+        unit = where[patch.UNIT]
+        start[0], start[1] = _index(u, where[0], where[2], where[3]), _index(v, where[1], where[2], where[4])
+        _peak_value(window[0], where, start)
+        patch.grow(window, where, image, start[0], start[1], level, q[CLIPPED], len(_LEVELS) + 2)
+        area = sums[patch.N]
+    center, cov = np.empty(2), np.empty(3)
+    variance = noise**2 + q[SIGNAL_NOISE] * max(sums[patch.W] / area, 0.0)
+    patch.balance(sums, variance * shared, center, cov)
+    cov *= unit * unit
+    shift_u, shift_v = _plane_shift(weight, planes)
+    middle = 0.5 * (unit / pitch - 1.0) * 0.0
+    center[0] = where[patch.LEFT] + unit * (start[0] + center[0]) + shift_u + middle
+    center[1] = where[patch.TOP] + unit * (start[1] + center[1]) + shift_v + middle
+    if radius <= q[SMALL_PX] and sums[patch.EDGE] == 0.0:
+        sample_noise = noise if planes < 4 else max(noise / np.sqrt((weight**2).sum()), q[MIN_NOISE])
+        width = patch.fit(
+            image, planes, scale, weight, center, max(radius / 1.18, 0.8), sample_noise, q[SIGNAL_NOISE], q[CLIPPED], cov
         )
-        budget -= looked
-        if share == 0.0:
-            continue
-        area, radius = sums[0], np.sqrt(sums[0] / np.pi)
-        flux = sums[6] + area * (level - background)
-        variance = noise[n] ** 2 + signal_noise * flux / area
-        _weigh(sums, start, variance, center, cov)
-        if sums[9] == 0.0 and sums[10] == 0.0 and radius <= small_px:
-            _refine(image, center, radius, background, variance, cov)
-        snr = flux / np.sqrt(area) / noise[n]
-        if radius < _FILTERED_PX:
-            snr = _filter_snr(image, center, _FILTER_PX, background, noise[n])
-        if snr < least:
-            continue
-        spot = spots[count]
-        spot[: V + 1] = center
-        spot[RADIUS], spot[FLUX], spot[LEVEL], spot[SNR] = radius, flux, share, snr
-        spot[ELONGATION], spot[FILL] = _shape(sums)
-        spot[SATURATED], spot[CUT] = sums[9] / area, sums[10] / area
-        spot[COARSE] = _is_coarse(image, v0, u0)
-        spot[VAR_UU:] = cov
-        count += 1
-        owned[stamp[v0, u0]] = 1
-    return spots[:count]
+        if width > 0.0:
+            cov *= shared
+            spot[RADIUS] = 1.18 * width
+    spot[U], spot[V] = center
+    floor_px = q[FLOOR_PX] ** 2 + (q[SATURATED_PX] ** 2 if spot[SATURATED] > 0.0 else 0.0)
+    if sums[patch.EDGE] > 0.0:
+        floor_px += (q[CUT_SHARE] * radius) ** 2
+    spot[VAR_UU] = cov[0] + floor_px + spread[0]
+    spot[VAR_UV] = cov[1] + spread[1]
+    spot[VAR_VV] = cov[2] + floor_px + spread[2]
+    return not _is_known(spots, n)
+
+
+@njit(cache=True)
+def _around(part: Array, where: Array, start: Indices, sums: Array, radii: float, floor: float) -> float:
+    """Mean level over the floor on a circle around a region's centre, of so many of its radii."""
+    radius = radii * np.sqrt(sums[patch.N] / np.pi) + 1.0
+    x, y = start[0] + sums[patch.X] / sums[patch.N], start[1] + sums[patch.Y] / sums[patch.N]
+    total, count = 0.0, 0
+    for k in range(12):
+        a, b = int(x + radius * np.cos(k * np.pi / 6.0) + 0.5), int(y + radius * np.sin(k * np.pi / 6.0) + 0.5)
+        if 0 <= a < where[patch.COLUMNS] and 0 <= b < where[patch.ROWS]:
+            total += part[b, a] - floor
+            count += 1
+    return total / max(count, 1)
+
+
+@njit(cache=True)
+def _plane_shift(weight: Array, planes: int) -> tuple[float, float]:
+    """Where the samples of a cell lie on the average: planes of a mosaic stand a pixel apart."""
+    if planes != 4:
+        return 0.0, 0.0
+    # the weight of a plane goes with its share of the light, its part of the sum with the square
+    total = (weight**2).sum()
+    return float((weight[1] ** 2 + weight[3] ** 2) / total), float((weight[2] ** 2 + weight[3] ** 2) / total)
+
+
+@njit(cache=True)
+def _unresolved(sums: Array, q: Array, unit: float) -> tuple[float, float, float]:
+    """Covariance of a region too long for one light: two that are not told apart, and either may be the one meant."""
+    uu, uv, vv = patch.moments(sums)
+    half, turn = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
+    if sums[patch.N] < 12.0 or np.sqrt(max(half - turn, 0.0) / (half + turn)) > q[MIN_ELONGATION] or turn <= 0.0:
+        return 0.0, 0.0, 0.0
+    excess = unit * unit
+    return excess * (turn + 0.5 * (uu - vv)), excess * uv, excess * (turn - 0.5 * (uu - vv))
+
+
+@njit(cache=True)
+def _is_known(spots: Array, n: int) -> bool:
+    for k in range(n):
+        if np.hypot(spots[k, U] - spots[n, U], spots[k, V] - spots[n, V]) < max(0.7 * spots[k, RADIUS], 1.5):
+            return True
+    return False
+
+
+@njit(cache=True)
+def _own(seen: Image, spot: Array) -> None:
+    """Mark the tiles whose centre a spot covers, and the one that it is in: nobody looks there again."""
+    t = tiles.TILE_PX
+    reach = spot[RADIUS]
+    for i in range(max(int((spot[V] - reach) / t), 0), min(int((spot[V] + reach) / t) + 1, seen.shape[0])):
+        for j in range(max(int((spot[U] - reach) / t), 0), min(int((spot[U] + reach) / t) + 1, seen.shape[1])):
+            inside = np.hypot((i + 0.5) * t - spot[V], (j + 0.5) * t - spot[U]) <= reach
+            if inside or (i == int((spot[V] + 0.5) / t) and j == int((spot[U] + 0.5) / t)):
+                seen[i, j] = 1
+
+
+@njit(cache=True)
+def _lamp_probability(spot: Array, q: Array) -> float:
+    """Probability of being a lamp, from contrast, shape and size: soft, so that geometry can overrule it."""
+    radius = spot[RADIUS]
+    seen = _logistic(spot[SNR] - 8.5)
+    small = np.exp(-radius / 3.0)  # the outline of a small spot says little of its shape
+    round_ = _logistic((spot[ELONGATION] - 0.5) / 0.06)
+    full = _logistic((spot[FILL] - 0.75) / 0.04)
+    shape = small + (1.0 - small) * round_ * full
+    largest = q[MAX_RADIUS_PX]
+    size = _logistic((0.5 * largest - radius) / (0.1 * largest)) * _logistic((radius - q[MIN_RADIUS_PX]) / 0.1)
+    usual = 0.7 if spot[SATURATED] > 0.0 else 0.5
+    alone = 1.0 - 2.0 * max(spot[LEVEL] - usual, 0.0)
+    return float(min(max(seen * shape * size * alone, 0.02), 0.98))
+
+
+@njit(cache=True)
+def _logistic(x: float) -> float:
+    return float(1.0 / (1.0 + np.exp(-x)))
+
+
+@njit(cache=True)
+def _dim_glints(spots: Array, n: int, q: Array) -> None:
+    """Make little of a spot near a much stronger one that may be a lamp: its reflection on the frame beside it."""
+    before = spots[:n, P_LIGHT].copy()
+    for k in range(n):
+        for m in range(n):
+            near = np.hypot(spots[k, U] - spots[m, U], spots[k, V] - spots[m, V]) < q[GLINT_RADII] * spots[m, RADIUS]
+            weaker = spots[m, FLUX] > q[GLINT_RATIO] * spots[k, FLUX]
+            if m != k and near and weaker and before[m] > q[GLINT_TRUST] * before[k]:
+                spots[k, P_LIGHT] = max(0.1 * before[k], 0.02)
+                break

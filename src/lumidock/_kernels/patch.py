@@ -1,0 +1,468 @@
+"""One light in a small window: cut out, flattened, grown at the level where it is round and alone, and its centre.
+
+Samples come as (H, W, C) of an unsigned type, 1 or 3 channels, or one channel that is a Bayer mosaic. A window is one
+plane of floats in 8-bit grey levels: the planes (colours) weighted by how far the light stands out in each. Large windows
+are thinned out to about `SIDE` samples a side.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lumidock.datatypes import Array, Image
+
+SIDE = 64
+_ROOM = SIDE + 16
+_RING = 24  # samples on a ring
+_COS, _SIN = np.cos(np.arange(_RING) * 2.0 * np.pi / _RING), np.sin(np.arange(_RING) * 2.0 * np.pi / _RING)
+_FIT_ROUNDS, _FIT_REACH = 6, 9
+_PRIOR_DOF = 20.0  # how much the expected noise counts beside the residuals of a fit
+# entries of `sums`, see `grow`; weights w are over the level
+N, X, Y, XX, XY, YY, W, WX, WY, CLIPPED, EDGE, OPEN = range(12)
+# the window's geometry, see `cut`
+LEFT, TOP, UNIT, COLUMNS, ROWS = range(5)
+Window = tuple[Array, NDArray[np.int16], NDArray[np.int32], Array]
+
+
+@njit(cache=True)
+def sample(image: Image, planes: int, p: int, v: int, u: int) -> float:
+    """One sample of plane `p` at pixel or, on a mosaic, in the 2 x 2 cell of a pixel."""
+    if planes == 1:
+        return float(image[v, u, 0])
+    if planes == 3:
+        return float(image[v, u, p])
+    return float(image[min((v & -2) + (p >> 1), image.shape[0] - 1), min((u & -2) + (p & 1), image.shape[1] - 1), 0])
+
+
+@njit(cache=True)
+def weigh(image: Image, planes: int, scale: float, v: int, u: int, radius: float, clipped: float, weight: Array) -> float:
+    """Write each plane's `weight` (4,) for a light at a pixel; returns the offset of the noise, sqrt of their squares.
+
+    Planes count by how far they stand out of a ring, as the best filter does for equal noise. Where some are saturated
+    and others that stand out well are not, only those others count: they still tell a core from its halo.
+    """
+    weight[:] = 0.0
+    if planes == 1:
+        weight[0] = 1.0
+        return 1.0
+    pitch = 2 if planes == 4 else 1
+    full = np.zeros(4)
+    reach = max(int(0.7 * radius), pitch)
+    for p in range(planes):
+        core, count = 0.0, 0
+        for y in range(max(v - reach, 0), min(v + reach + 1, image.shape[0]), max(reach, 1)):
+            for x in range(max(u - reach, 0), min(u + reach + 1, image.shape[1]), max(reach, 1)):
+                value = scale * sample(image, planes, p, y, x)
+                core += value
+                full[p] += value >= clipped
+                count += 1
+        dark, n = 0.0, 0
+        for k in range(0, _RING, 2):
+            x, y = int(u + 3.0 * radius * _COS[k]), int(v + 3.0 * radius * _SIN[k])
+            if 0 <= x < image.shape[1] and 0 <= y < image.shape[0]:
+                dark += scale * sample(image, planes, p, y, x)
+                n += 1
+        weight[p] = max(core / count - dark / max(n, 1), 0.0)
+    if full.max() > 0.0:
+        _prefer_unsaturated(weight, full, planes)
+    total = weight.sum()
+    if total <= 0.0:
+        weight[:planes] = 1.0 / planes
+        total = 1.0
+    weight /= total
+    return float(np.sqrt((weight**2).sum()))
+
+
+@njit(cache=True)
+def _prefer_unsaturated(weight: Array, full: Array, planes: int) -> None:
+    least = 9.0
+    for p in range(planes):
+        if weight[p] > 30.0:
+            least = min(least, full[p])
+    for p in range(planes):
+        if weight[p] <= 30.0 or full[p] > least:
+            weight[p] = 0.0
+        else:
+            weight[p] = 1.0
+
+
+@njit(cache=True)
+def cut(
+    image: Image, planes: int, scale: float, weight: Array, v: int, u: int, reach: float, patch: Array, where: Array
+) -> None:
+    """Fill `patch` with the window of `reach` px around a pixel; `where` becomes its left, top, unit, columns, rows."""
+    pitch = 2 if planes == 4 else 1
+    unit = pitch * max(int(np.ceil(2.0 * reach / (pitch * SIDE))), 1)
+    left, top = max(u - int(reach), 0) // pitch * pitch, max(v - int(reach), 0) // pitch * pitch
+    columns = min((min(u + int(reach) + 1, image.shape[1]) - left) // unit, _ROOM)
+    rows = min((min(v + int(reach) + 1, image.shape[0]) - top) // unit, _ROOM)
+    where[0], where[1], where[2], where[3], where[4] = left, top, unit, max(columns, 1), max(rows, 1)
+    for i in range(max(rows, 1)):
+        y = top + i * unit
+        for j in range(max(columns, 1)):
+            x = left + j * unit
+            if planes == 1:
+                patch[i, j] = scale * image[y, x, 0]
+            elif planes == 3:
+                mixed = weight[0] * image[y, x, 0] + weight[1] * image[y, x, 1] + weight[2] * image[y, x, 2]
+                patch[i, j] = scale * mixed
+            else:
+                total = 0.0
+                for p in range(4):
+                    total += weight[p] * sample(image, planes, p, y, x)
+                patch[i, j] = scale * total
+
+
+@njit(cache=True)
+def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> float:
+    """Level of the ring of `radius` around a sample, whose slope is taken out of the patch: what a neighbour's halo adds.
+
+    The mean of the middle half of the ring, and the slope by least squares of what lies within Tukey's fences.
+    """
+    columns, rows = int(where[COLUMNS]), int(where[ROWS])
+    values, ordered = np.empty(_RING), np.empty(_RING)
+    count = 0
+    for k in range(_RING):
+        a, b = int(np.floor(x + radius * _COS[k] + 0.5)), int(np.floor(y + radius * _SIN[k] + 0.5))
+        inside = 0 <= a < columns and 0 <= b < rows
+        values[k] = patch[b, a] if inside else np.nan
+        if inside:
+            n = count
+            while n > 0 and ordered[n - 1] > patch[b, a]:
+                ordered[n] = ordered[n - 1]
+                n -= 1
+            ordered[n] = patch[b, a]
+            count += 1
+    if count == 0:
+        return 0.0
+    quarter = count // 4
+    level = ordered[quarter : count - quarter].mean()
+    low, high = ordered[quarter], ordered[count - 1 - quarter]
+    fence = 1.5 * (high - low)
+    gx, gy, opposite = 0.0, 0.0, 0
+    for k in range(_RING // 2):
+        a, b = values[k], values[k + _RING // 2]
+        if low - fence <= a <= high + fence and low - fence <= b <= high + fence:
+            gx += (a - b) * _COS[k]
+            gy += (a - b) * _SIN[k]
+            opposite += 1
+    if opposite < _RING // 3:
+        return level
+    gx, gy = gx / (opposite * radius), gy / (opposite * radius)
+    for i in range(rows):
+        for j in range(columns):
+            patch[i, j] -= gx * (j - x) + gy * (i - y)
+    return level
+
+
+@njit(cache=True)
+def rim_noise(patch: Array, where: Array) -> float:
+    """1 sigma of a sample, from second differences along the outer rows of a window; large ones, of edges, left out."""
+    columns, rows = int(where[COLUMNS]), int(where[ROWS])
+    if columns < 5 or rows < 3:
+        return 0.0
+    limit, sigma = 1e9, 0.0
+    for _ in range(2):
+        total, count = 0.0, 0
+        for i in (0, 1, rows - 2, rows - 1):
+            for j in range(columns - 4):
+                d = abs(patch[i, j] - 2.0 * patch[i, j + 2] + patch[i, j + 4])
+                if d <= limit:
+                    total += d
+                    count += 1
+        sigma = 0.5117 * total / max(count, 1)
+        limit = 8.0 * sigma
+    return sigma
+
+
+@njit(cache=True)
+def filter_snr(patch: Array, where: Array, x: float, y: float, width: float, level: float, noise: float) -> float:
+    """Signal-to-noise ratio under a Gaussian window of `width` samples."""
+    reach = int(np.ceil(2.5 * width))
+    total, power = 0.0, 0.0
+    for i in range(max(int(y) - reach, 0), min(int(y) + reach + 2, int(where[ROWS]))):
+        for j in range(max(int(x) - reach, 0), min(int(x) + reach + 2, int(where[COLUMNS]))):
+            a, b = j - x, i - y
+            window = np.exp(-0.5 * (a * a + b * b) / (width * width))
+            total += window * (patch[i, j] - level)
+            power += window * window
+    return float(total / (noise * np.sqrt(max(power, 1e-12))))
+
+
+@njit(cache=True)
+def grow(window: Window, where: Array, image: Image, x: int, y: int, level: float, clipped: float, mark: int) -> None:
+    """Sum up the connected samples over `level` around one, coordinates relative to it, into the window's sums.
+
+    `CLIPPED` counts saturated samples, `EDGE` those at the picture's edge, `OPEN` those at the window's.
+    """
+    patch, stamp, stack, sums = window
+    columns, rows = int(where[COLUMNS]), int(where[ROWS])
+    at_left, at_top = where[LEFT] <= 1.0, where[TOP] <= 1.0
+    at_right = where[LEFT] + where[UNIT] * columns >= image.shape[1] - 1
+    at_bottom = where[TOP] + where[UNIT] * rows >= image.shape[0] - 1
+    sums[:] = 0.0
+    stack[0, 0], stack[0, 1] = x, y
+    stamp[y, x] = mark
+    top = 1
+    while top:
+        top -= 1
+        j, i = stack[top, 0], stack[top, 1]
+        a, b, weight = float(j - x), float(i - y), patch[i, j] - level
+        sums[N] += 1.0
+        sums[X] += a
+        sums[Y] += b
+        sums[XX] += a * a
+        sums[XY] += a * b
+        sums[YY] += b * b
+        sums[W] += weight
+        sums[WX] += weight * a
+        sums[WY] += weight * b
+        sums[CLIPPED] += patch[i, j] >= clipped
+        if j == 0 or i == 0 or j == columns - 1 or i == rows - 1:
+            cut_off = (j == 0 and at_left) or (i == 0 and at_top)
+            cut_off = cut_off or (j == columns - 1 and at_right) or (i == rows - 1 and at_bottom)
+            sums[EDGE if cut_off else OPEN] += 1.0
+        for k in range(4):
+            c, d = j + (k == 0) - (k == 1), i + (k == 2) - (k == 3)
+            if 0 <= c < columns and 0 <= d < rows and stamp[d, c] != mark and patch[d, c] > level:
+                stamp[d, c] = mark
+                stack[top, 0], stack[top, 1] = c, d
+                top += 1
+
+
+@njit(cache=True)
+def shape(sums: Array) -> tuple[float, float]:
+    """Ratio of the axes of the ellipse with the region's second moments, and the region's area over the ellipse's."""
+    n = sums[N]
+    uu, uv, vv = moments(sums)
+    half, turn = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
+    area = 4.0 * np.pi * np.sqrt(max(uu * vv - uv * uv, 1e-12))
+    return np.sqrt(max(half - turn, 1e-12) / (half + turn)), n / area
+
+
+@njit(cache=True)
+def moments(sums: Array) -> tuple[float, float, float]:
+    """Second central moments of the region, of samples that are unit squares."""
+    n = sums[N]
+    uu = (sums[XX] - sums[X] ** 2 / n) / n + 1.0 / 12.0
+    vv = (sums[YY] - sums[Y] ** 2 / n) / n + 1.0 / 12.0
+    return uu, (sums[XY] - sums[X] * sums[Y] / n) / n, vv
+
+
+@njit(cache=True)
+def balance(sums: Array, variance: float, center: Array, cov: Array) -> None:
+    """Write the weighted centre (2,) of a region, relative to its start, and its covariance `cov` (3,) for noise of
+    `variance` a sample."""
+    x, y = sums[WX] / sums[W], sums[WY] / sums[W]
+    center[0], center[1] = x, y
+    cov[0] = sums[XX] - 2.0 * x * sums[X] + sums[N] * x * x
+    cov[1] = sums[XY] - x * sums[Y] - y * sums[X] + sums[N] * x * y
+    cov[2] = sums[YY] - 2.0 * y * sums[Y] + sums[N] * y * y
+    cov *= variance / sums[W] ** 2
+
+
+@njit(cache=True)
+def fit(
+    image: Image,
+    planes: int,
+    scale: float,
+    weight: Array,
+    center: Array,
+    width: float,
+    noise: float,
+    signal_noise: float,
+    clipped: float,
+    cov: Array,
+) -> float:
+    """Move `center` (2,) to the maximum-likelihood position of a round Gaussian; its covariance goes to `cov` (3,).
+
+    Position and width are common, amplitude and background are of each plane and eliminated (variable projection), so
+    that a mosaic's coarse planes bias nothing; saturated samples are left out, which is how the wings of a small clipped
+    light give its centre. The residuals scale the covariance. Returns the width, 0 where the fit does not settle, which
+    leaves everything as it was.
+    """
+    reach = min(max(int(np.ceil(2.2 * width)) + 1, 3 if planes < 4 else 4), _FIT_REACH)
+    u0, v0 = int(np.floor(center[0] + 0.5)), int(np.floor(center[1] + 0.5))
+    left, right = max(u0 - reach, 0), min(u0 + reach + 1, image.shape[1])
+    top, bottom = max(v0 - reach, 0), min(v0 + reach + 1, image.shape[0])
+    parts = 4 if planes == 4 else 1
+    ex, ey = np.empty(right - left), np.empty(bottom - top)
+    z = np.empty((bottom - top, right - left))
+    for i in range(bottom - top):
+        for j in range(right - left):
+            if planes == 3:
+                mixed, most = 0.0, 0.0
+                for p in range(3):
+                    mixed += weight[p] * image[top + i, left + j, p]
+                    most = max(most, float(image[top + i, left + j, p]) if weight[p] > 0.0 else 0.0)
+            else:
+                mixed = most = float(image[top + i, left + j, 0])
+            z[i, j] = scale * mixed if scale * most < clipped else np.nan
+    u, v, s = center[0], center[1], width
+    amplitude, ground = np.zeros(4), np.zeros(4)
+    chi2, dof, dx, dy = 0.0, 0.0, 1.0, 1.0
+    S = np.zeros((3, 3))
+    for turn in range(_FIT_ROUNDS):
+        for j in range(right - left):
+            ex[j] = np.exp(-0.5 * ((left + j - u) / s) ** 2)
+        for i in range(bottom - top):
+            ey[i] = np.exp(-0.5 * ((top + i - v) / s) ** 2)
+        _amplitudes(z, ex, ey, left, top, parts, noise, signal_noise, turn > 0, amplitude, ground)
+        chi2, dof, right_side = _normal_equations(
+            z, ex, ey, left, top, parts, noise, signal_noise, amplitude, ground, u, v, s, S
+        )
+        step, solved = _solve(S, right_side)
+        if not solved:
+            return 0.0
+        dx, dy = step[0], step[1]
+        if np.hypot(dx, dy) > width:
+            return 0.0
+        u, v = u + dx, v + dy
+        s = min(max(s + step[2], 0.7 * s), 1.4 * s)
+        if dx * dx + dy * dy < 1e-5 and turn > 0:
+            break
+    if dx * dx + dy * dy > 1e-2 or np.hypot(u - center[0], v - center[1]) > width or not 0.4 < s < 2.0 * width:
+        return 0.0
+    inverse, solved = _top_left_of_inverse(S)
+    if not solved:
+        return 0.0
+    center[0], center[1] = u, v
+    misfit = (_PRIOR_DOF + chi2) / (_PRIOR_DOF + max(dof, 0.0))
+    cov[0], cov[1], cov[2] = inverse[0] * misfit, inverse[1] * misfit, inverse[2] * misfit
+    return s
+
+
+@njit(cache=True)
+def _amplitudes(
+    z: Array,
+    ex: Array,
+    ey: Array,
+    left: int,
+    top: int,
+    parts: int,
+    noise: float,
+    signal_noise: float,
+    weighted: bool,
+    amplitude: Array,
+    ground: Array,
+) -> None:
+    """Least-squares amplitude and background of each plane under the present profile."""
+    gg, g1, n, gz, z1 = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4)
+    for i in range(len(ey)):
+        for j in range(len(ex)):
+            value = z[i, j]
+            if np.isnan(value):
+                continue
+            p = ((top + i) & 1) * 2 + ((left + j) & 1) if parts == 4 else 0
+            g = ex[j] * ey[i]
+            w = 1.0
+            if weighted:
+                w = 1.0 / (noise * noise + signal_noise * max(amplitude[p], 0.0) * g)
+            gg[p] += w * g * g
+            g1[p] += w * g
+            n[p] += w
+            gz[p] += w * g * value
+            z1[p] += w * value
+    for p in range(parts):
+        det = gg[p] * n[p] - g1[p] ** 2
+        if n[p] > 0.0 and det > 1e-9 * gg[p] * n[p]:
+            amplitude[p] = (n[p] * gz[p] - g1[p] * z1[p]) / det
+            ground[p] = (gg[p] * z1[p] - g1[p] * gz[p]) / det
+        else:
+            amplitude[p], ground[p] = 0.0, z1[p] / max(n[p], 1e-12)
+
+
+@njit(cache=True)
+def _normal_equations(
+    z: Array,
+    ex: Array,
+    ey: Array,
+    left: int,
+    top: int,
+    parts: int,
+    noise: float,
+    signal_noise: float,
+    amplitude: Array,
+    ground: Array,
+    u: float,
+    v: float,
+    s: float,
+    S: Array,
+) -> tuple[float, float, Array]:
+    """Schur complement `S` (3, 3) of position and width, and its right side; also chi-square and degrees of freedom."""
+    M, B, right_side = np.zeros((4, 3)), np.zeros((4, 2, 3)), np.zeros(3)
+    S[:] = 0.0
+    chi2, dof = 0.0, -3.0 - 2.0 * parts
+    for i in range(len(ey)):
+        b = (top + i - v) / s
+        for j in range(len(ex)):
+            value = z[i, j]
+            if np.isnan(value):
+                continue
+            p = ((top + i) & 1) * 2 + ((left + j) & 1) if parts == 4 else 0
+            g, a = ex[j] * ey[i], (left + j - u) / s
+            A = amplitude[p]
+            w = 1.0 / (noise * noise + signal_noise * max(A, 0.0) * g)
+            r = value - ground[p] - A * g
+            scaled = A * g / s
+            j0, j1, j2 = scaled * a, scaled * b, scaled * (a * a + b * b)
+            chi2 += w * r * r
+            dof += 1.0
+            S[0, 0] += w * j0 * j0
+            S[0, 1] += w * j0 * j1
+            S[0, 2] += w * j0 * j2
+            S[1, 1] += w * j1 * j1
+            S[1, 2] += w * j1 * j2
+            S[2, 2] += w * j2 * j2
+            right_side[0] += w * j0 * r
+            right_side[1] += w * j1 * r
+            right_side[2] += w * j2 * r
+            M[p, 0] += w * g * g
+            M[p, 1] += w * g
+            M[p, 2] += w
+            for k, jk in enumerate((j0, j1, j2)):
+                B[p, 0, k] += w * g * jk
+                B[p, 1, k] += w * jk
+    for p in range(parts):
+        det = M[p, 0] * M[p, 2] - M[p, 1] ** 2
+        if not det > 1e-9 * M[p, 0] * M[p, 2]:
+            continue
+        for k in range(3):
+            for m in range(k, 3):
+                S[k, m] -= (
+                    M[p, 2] * B[p, 0, k] * B[p, 0, m]
+                    - M[p, 1] * (B[p, 0, k] * B[p, 1, m] + B[p, 1, k] * B[p, 0, m])
+                    + M[p, 0] * B[p, 1, k] * B[p, 1, m]
+                ) / det
+    S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
+    return chi2, dof, right_side
+
+
+@njit(cache=True)
+def _solve(S: Array, b: Array) -> tuple[Array, bool]:
+    """Solution (3,) of S x = b by the adjugate."""
+    c0 = S[1, 1] * S[2, 2] - S[1, 2] * S[2, 1]
+    c1 = S[1, 2] * S[2, 0] - S[1, 0] * S[2, 2]
+    c2 = S[1, 0] * S[2, 1] - S[1, 1] * S[2, 0]
+    det = S[0, 0] * c0 + S[0, 1] * c1 + S[0, 2] * c2
+    x = np.zeros(3)
+    if not det > 1e-12 * S[0, 0] * S[1, 1] * S[2, 2]:
+        return x, False
+    x[0] = (c0 * b[0] + (S[0, 2] * S[2, 1] - S[0, 1] * S[2, 2]) * b[1] + (S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]) * b[2]) / det
+    x[1] = (c1 * b[0] + (S[0, 0] * S[2, 2] - S[0, 2] * S[2, 0]) * b[1] + (S[0, 2] * S[1, 0] - S[0, 0] * S[1, 2]) * b[2]) / det
+    x[2] = (c2 * b[0] + (S[0, 1] * S[2, 0] - S[0, 0] * S[2, 1]) * b[1] + (S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]) * b[2]) / det
+    return x, True
+
+
+@njit(cache=True)
+def _top_left_of_inverse(S: Array) -> tuple[tuple[float, float, float], bool]:
+    """The entries uu, uv, vv of the inverse of S (3, 3)."""
+    a = S[0, 0] - S[0, 2] ** 2 / S[2, 2]
+    b = S[0, 1] - S[0, 2] * S[1, 2] / S[2, 2]
+    c = S[1, 1] - S[1, 2] ** 2 / S[2, 2]
+    det = a * c - b * b
+    if not (det > 1e-12 * a * c and a > 0.0):
+        return (0.0, 0.0, 0.0), False
+    return (c / det, -b / det, a / det), True

@@ -1,0 +1,261 @@
+"""The one pass over a frame: largest value of every 8 x 8 tile, local noise, and the tiles worth a closer look.
+
+Rows are (H, W * channels) of an unsigned type; a tile's value is that of its brightest sample of any channel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from lumidock.datatypes import Array, Image, Indices
+
+TILE_PX, BLOCK = 8, 8  # pixels a side of a tile, tiles a side of a block
+SPARSE = 4  # one block in so many says how samples share their noise
+_FAR = 4  # tiles at which the slopes of a wide light show
+_SIGMA = 0.5117  # of the mean absolute second difference of normal noise: sqrt(pi / 12)
+# compare-exchanges that sort eight values. Source: K. E. Batcher, 1968
+_LOW = np.array([0, 2, 4, 6, 0, 1, 4, 5, 1, 5, 0, 1, 2, 3, 2, 3, 1, 3, 5])
+_LOW_OF_FIVE, _HIGH_OF_FIVE = np.array([0, 1, 0, 1, 0, 2, 1, 3, 2]), np.array([3, 4, 2, 3, 1, 4, 2, 4, 3])
+_HIGH = np.array([1, 3, 5, 7, 2, 3, 6, 7, 2, 6, 4, 5, 6, 7, 4, 5, 2, 4, 6])
+
+
+@njit(cache=True)
+def refresh(rows: Image, channels: int, rect: Indices, peak: Image, line: Image) -> int:
+    """Write the largest value of each tile of `rect` (first and last row, first and last column) into `peak` (h, w).
+
+    `line` (2 W + 16 channels) * channels is scratch. Returns the largest value of all.
+    """
+    height, width = rows.shape
+    span = TILE_PX * channels
+    left, right = rect[2] * span, min(rect[3] * span, width)
+    n, padded = right - left, (rect[3] - rect[2]) * span
+    highest = 0
+    for i in range(rect[0], rect[1]):
+        top, bottom = i * TILE_PX, min((i + 1) * TILE_PX, height)
+        # read in the order of memory: eight rows at a time alone would keep the memory waiting
+        for v in range(top, bottom):
+            highest = max(highest, _largest(rows[v, left:right]))
+        if bottom == top + TILE_PX:
+            _max_of_eight(rows[top:bottom, left:right], line[:n])
+        else:
+            line[:n] = rows[top, left:right]
+            for v in range(top + 1, bottom):
+                _keep_larger(line[:n], rows[v, left:right])
+        line[n:padded] = 0
+        if channels == 1:
+            _largest_of_tiles(line[:padded], peak[i, rect[2] : rect[3]])
+        else:
+            _largest_of_wide_tiles(line[:padded], line[len(line) // 2 :], peak[i, rect[2] : rect[3]])
+    return highest
+
+
+@njit(cache=True)
+def _largest(row: Image) -> int:
+    highest = row[0]
+    for x in range(len(row)):
+        highest = row[x] if row[x] > highest else highest
+    return int(highest)
+
+
+@njit(cache=True)
+def _max_of_eight(r: Image, line: Image) -> None:
+    a, b, c, d, e, f, g, h = r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7]
+    for x in range(len(line)):
+        line[x] = max(max(max(a[x], b[x]), max(c[x], d[x])), max(max(e[x], f[x]), max(g[x], h[x])))
+
+
+@njit(cache=True)
+def _keep_larger(line: Image, row: Image) -> None:
+    for x in range(len(line)):
+        line[x] = max(line[x], row[x])
+
+
+@njit(cache=True)
+def _largest_of_tiles(line: Image, out: Image) -> None:
+    for j in range(len(out)):
+        highest = line[TILE_PX * j]
+        for k in range(1, TILE_PX):
+            value = line[TILE_PX * j + k]
+            highest = value if value > highest else highest
+        out[j] = highest
+
+
+@njit(cache=True)
+def _larger(a: Image, b: Image, out: Image) -> None:
+    for x in range(len(out)):
+        out[x] = max(a[x], b[x])
+
+
+@njit(cache=True)
+def _largest_of_wide_tiles(line: Image, scratch: Image, out: Image) -> None:
+    """The same for three channels: each halving is one run along the whole line."""
+    n = len(line) - 12
+    _larger(line[:n], line[12:], scratch[:n])
+    _larger(scratch[: n - 6], scratch[6:n], line[: n - 6])
+    _larger(line[: n - 9], line[3 : n - 6], scratch[: n - 9])
+    for j in range(len(out)):
+        x = 3 * TILE_PX * j
+        out[j] = max(scratch[x], max(scratch[x + 1], scratch[x + 2]))
+
+
+@njit(cache=True)
+def noise(rows: Image, channels: int, blocks: tuple[int, int], sigma: Array, shared: Array) -> None:
+    """Write the noise of the rows of blocks from `blocks[0]` to `blocks[1]`: 1 sigma of a sample, `sigma` (h, w).
+
+    `shared` (h, w / 4): how much more the sums of eight neighbours vary than independent samples would make them; demosaicing
+    and JPEG share noise. One row of pixels speaks for a row of blocks, by second differences, which no slope reaches, of
+    every other pixel, which a mosaic does not.
+    """
+    samples = rows.shape[1]
+    for b in range(blocks[0], blocks[1]):
+        row = rows[min(b * BLOCK * TILE_PX + 3 * TILE_PX, len(rows) - 1)]
+        for k in range(sigma.shape[1]):
+            low, n = k * BLOCK * TILE_PX * channels, BLOCK * TILE_PX * channels
+            low = max(min(low, samples - n), 0)
+            part = row[low : min(low + n, samples)]
+            sigma[b, k] = _SIGMA * _second_difference(part, 2 * channels)
+            if k % SPARSE == 0:
+                shared[b, k // SPARSE] = _SIGMA * _second_difference_of_sums(part, channels)
+
+
+@njit(cache=True)
+def _second_difference(row: Image, step: int) -> float:
+    """Mean absolute second difference of samples `step` apart."""
+    n = len(row) - 2 * step
+    if n <= 0:
+        return 0.0
+    a, b, c = row[:n], row[step : n + step], row[2 * step :]
+    total = np.int32(0)
+    for x in range(n):
+        total += abs(np.int32(a[x]) - np.int32(2) * np.int32(b[x]) + np.int32(c[x]))
+    return total / n
+
+
+@njit(cache=True)
+def _second_difference_of_sums(row: Image, channels: int) -> float:
+    """The same of sums of `TILE_PX` neighbours of one channel, over the root of their number."""
+    count = len(row) // (TILE_PX * channels)
+    if count < 3:
+        return 0.0
+    total, first, second = 0.0, 0.0, 0.0
+    for k in range(count):
+        s = np.int32(0)
+        for x in range(TILE_PX):
+            s += np.int32(row[(k * TILE_PX + x) * channels + channels // 2])
+        if k > 1:
+            total += abs(first - 2.0 * second + s)
+        first, second = second, float(s)
+    return total / ((count - 2) * np.sqrt(TILE_PX))
+
+
+@njit(cache=True)
+def levels(peak: Image, blocks: tuple[int, int], level: Image) -> None:
+    """Write the median of the tiles of each block, row by row and then of those, of some rows of blocks, to `level`."""
+    h, w = peak.shape
+    columns, rows = np.empty((8, w), peak.dtype), np.empty((8, level.shape[1]), peak.dtype)
+    for b in range(blocks[0], blocks[1]):
+        for k in range(8):
+            columns[k] = peak[min(b * BLOCK + k, h - 1)]
+        _sort_columns(columns)
+        for j in range(level.shape[1]):
+            for k in range(8):
+                rows[k, j] = columns[4, min(j * BLOCK + k, w - 1)]
+        _sort_columns(rows)
+        level[b] = rows[4]
+
+
+@njit(cache=True)
+def smoothed(values: Array, out: Array) -> None:
+    """Write the median of five columns of the medians of five rows around each of `values` (h, w) to `out`."""
+    h, w = values.shape
+    rows, columns = np.empty((8, w), np.float32), np.empty((8, w), np.float32)
+    for i in range(h):
+        for k in range(5):
+            rows[k] = values[min(max(i + k - 2, 0), h - 1)]
+        _sort_columns_of_five(rows)
+        for j in range(w):
+            for k in range(5):
+                columns[k, j] = rows[2, min(max(j + k - 2, 0), w - 1)]
+        _sort_columns_of_five(columns)
+        out[i] = columns[2]
+
+
+@njit(cache=True)
+def _sort_columns_of_five(values: Array) -> None:
+    for k in range(len(_LOW_OF_FIVE)):
+        _exchange(values[_LOW_OF_FIVE[k]], values[_HIGH_OF_FIVE[k]])
+
+
+@njit(cache=True)
+def _sort_columns(values: Image) -> None:
+    """Sort each column of `values` (8, n)."""
+    for k in range(len(_LOW)):
+        _exchange(values[_LOW[k]], values[_HIGH[k]])
+
+
+@njit(cache=True)
+def _exchange(a: Image, b: Image) -> None:
+    for x in range(len(a)):
+        low, high = min(a[x], b[x]), max(a[x], b[x])
+        a[x], b[x] = low, high
+
+
+@njit(cache=True)
+def candidates(
+    peak: Image, level: Array, sigma: Array, contrast: float, clipped: float, rect: Indices, seen: Image, found: Array
+) -> int:
+    """Write the tiles of `rect` that may hold a light's peak to `found` (n, 3): row, column, sigmas over the background.
+
+    Such a tile clears its background by `contrast` sigmas; no two neighbours on opposite sides are brighter together,
+    as on a slope, and next to it or a few tiles away they are darker by a margin, as on a halo they are not. Tiles that
+    are `seen` (h, w) are left out, and the others become it. Returns how many there are, also of those that `found` has no room for.
+    """
+    count, least = 0, np.empty(peak.shape[1], peak.dtype)
+    for i in range(rect[0], rect[1]):
+        b = i // BLOCK
+        if i == rect[0] or i % BLOCK == 0:
+            for j in range(rect[2], rect[3]):
+                least[j] = min(np.ceil(level[b, j // BLOCK] + contrast * sigma[b, j // BLOCK]), clipped)
+        if not _any_reaches(peak[i, rect[2] : rect[3]], least[rect[2] : rect[3]]):
+            continue
+        for j in range(rect[2], rect[3]):
+            if peak[i, j] < least[j] or seen[i, j]:
+                continue
+            here = sigma[b, j // BLOCK]
+            if not _stands_out(peak, i, j, 1.5 * contrast * here, clipped):
+                continue
+            seen[i, j] = 1
+            if count < len(found):
+                found[count, 0], found[count, 1] = i, j
+                found[count, 2] = (peak[i, j] - level[b, j // BLOCK]) / here
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _any_reaches(values: Image, least: Image) -> bool:
+    reached = False
+    for j in range(len(values)):
+        reached |= values[j] >= least[j]
+    return reached
+
+
+@njit(cache=True)
+def _stands_out(peak: Image, i: int, j: int, margin: float, clipped: float) -> bool:
+    near = _over_pairs(peak, i, j, 1)
+    if near < 0.0:
+        return False
+    return bool(peak[i, j] >= clipped or near >= margin or _over_pairs(peak, i, j, _FAR) >= margin)
+
+
+@njit(cache=True)
+def _over_pairs(peak: Image, i: int, j: int, d: int) -> float:
+    """Twice the value of a tile less that of two on opposite sides, `d` tiles away, the least of four ways."""
+    h, w = peak.shape
+    top, bottom, left, right = max(i - d, 0), min(i + d, h - 1), max(j - d, 0), min(j + d, w - 1)
+    most = max(
+        max(float(peak[top, j]) + float(peak[bottom, j]), float(peak[i, left]) + float(peak[i, right])),
+        max(float(peak[top, left]) + float(peak[bottom, right]), float(peak[top, right]) + float(peak[bottom, left])),
+    )
+    return 2.0 * float(peak[i, j]) - most
