@@ -39,6 +39,7 @@ _MAX_TILES = 20  # a light is not wider
 _FILTER_PX = 1.2  # width of the window that judges a small spot ...
 _FILTERED_PX = 3.0  # ... up to this radius
 _ROUNDS = 4
+_LEAST_STEP = 30.0  # levels by which a saturated light stands out in the plane that shows it best
 
 
 @njit(cache=True)
@@ -178,24 +179,30 @@ def _measure(
     v, u, alone = _brightest(image, i, j)
     if not alone:
         return -1
-    radius = _extent(peak, i, j, base / scale)
     weight, where, start = np.zeros(4), np.zeros(5), np.zeros(2, np.int64)
-    share = patch.weigh(image, planes, scale, v, u, max(min(radius, q[MAX_RADIUS_PX]), 3.0), q[CLIPPED], weight)
+    radius, clipped = 0.0, scale * peak[i, j] >= q[CLIPPED]
+    if clipped:
+        radius = patch.weigh_clipped(image, planes, scale, v, u, _LEAST_STEP, q[MAX_RADIUS_PX], weight)
+        if radius == 0.0:
+            return -1
+    else:
+        radius = min(_extent(peak, i, j, base / scale), q[MAX_RADIUS_PX])
+        patch.weigh(image, planes, scale, v, u, radius, weight)
+    expected = noise * np.sqrt((weight**2).sum())
     reach = min(max(3.5 * radius, 1.5 * q[RING_PX]), 3.5 * q[MAX_RADIUS_PX])
-    part, floor = 0.0, 0.0
+    part, ground = 0.0, np.zeros(3)  # level, noise and texture of the surroundings
     for turn in range(_ROUNDS):
         patch.cut(image, planes, scale, weight, v, u, reach, window[0], where)
         start[0], start[1] = _index(u, where[0], where[2], where[3]), _index(v, where[1], where[2], where[4])
         ring = 0.9 * reach / where[patch.UNIT]
-        floor = patch.flatten(window[0], where, float(start[0]), float(start[1]), ring)
-        here = max(patch.rim_noise(window[0], where), 0.5 * noise * share, q[MIN_NOISE] * share)
-        if turn == 0 and radius <= tiles.TILE_PX:
-            width = _FILTER_PX / where[patch.UNIT]
-            snr = patch.filter_snr(window[0], where, float(start[0]), float(start[1]), max(width, 0.7), floor, here)
-            if snr < 0.7 * q[MIN_SNR] * np.sqrt(shared):
-                return -1 if turn == 0 else 0
-        noise = here
-        part = _level(image, planes, window, where, start, floor, q, spots, n)
+        ground[0], spread = patch.flatten(window[0], where, float(start[0]), float(start[1]), ring)
+        ground[1] = max(patch.rim_noise(window[0], where), 0.5 * expected, q[MIN_NOISE] * expected / noise)
+        ground[2] = np.sqrt(max(spread**2 - 2.0 * ground[1] ** 2, 0.0))
+        if turn == 0 and not clipped:
+            width = max(_FILTER_PX / where[patch.UNIT], 0.7)
+            if _snr(window[0], where, float(start[0]), float(start[1]), width, ground, shared) < 0.5 * q[MIN_SNR]:
+                return -1
+        part = _level(image, planes, window, where, start, ground[0], q, spots, n)
         sums = window[3]
         if part == 0.0:
             if reach >= 3.5 * q[MAX_RADIUS_PX] or sums[patch.OPEN] == 0.0:
@@ -209,7 +216,14 @@ def _measure(
         reach = wanted
     if part == 0.0:
         return 0
-    return int(_describe(image, planes, scale, weight, window, where, start, u, v, part, floor, noise, shared, q, spots, n))
+    return int(_describe(image, planes, scale, weight, window, where, start, u, v, part, ground, shared, q, spots, n))
+
+
+@njit(cache=True)
+def _snr(part: Array, where: Array, x: float, y: float, width: float, ground: Array, shared: float) -> float:
+    """How far a Gaussian window stands out of noise, which averages out in it, and texture, which does not."""
+    amplitude, averaged = patch.filtered(part, where, x, y, width, ground[0])
+    return float(amplitude / np.sqrt(shared * ground[1] ** 2 / averaged + ground[2] ** 2))
 
 
 @njit(cache=True)
@@ -288,8 +302,7 @@ def _describe(
     u: int,
     v: int,
     share: float,
-    floor: float,
-    noise: float,
+    ground: Array,
     shared: float,
     q: Array,
     spots: Array,
@@ -297,6 +310,7 @@ def _describe(
 ) -> bool:
     """Fill `spots[n]` from the grown region; False for what is too faint, or a spot that is there already."""
     spot, sums = spots[n], window[3]
+    floor, noise = ground[0], ground[1]
     top = window[0][start[1], start[0]]
     level = floor + share * (top - floor)
     unit = where[patch.UNIT]
@@ -304,12 +318,10 @@ def _describe(
     radius = np.sqrt(area / np.pi) * unit
     spot[HALO] = _around(window[0], where, start, sums, 2.0, floor) / max(top - floor, 1e-6)
     flux = sums[patch.W] + area * (level - floor)
-    snr = flux / (np.sqrt(area) * noise)
+    snr = flux / (area * np.sqrt(shared * noise**2 / area + ground[2] ** 2))
     if radius < _FILTERED_PX:
-        width = max(_FILTER_PX / unit, 0.7)
         x, y = start[0] + sums[patch.X] / area, start[1] + sums[patch.Y] / area
-        snr = patch.filter_snr(window[0], where, x, y, width, floor, noise)
-    snr /= np.sqrt(shared)
+        snr = _snr(window[0], where, x, y, max(_FILTER_PX / unit, 0.7), ground, shared)
     if snr < q[MIN_SNR]:
         return False
     pitch = 2.0 if planes == 4 else 1.0

@@ -37,55 +37,87 @@ def sample(image: Image, planes: int, p: int, v: int, u: int) -> float:
 
 
 @njit(cache=True)
-def weigh(image: Image, planes: int, scale: float, v: int, u: int, radius: float, clipped: float, weight: Array) -> float:
-    """Write each plane's `weight` (4,) for a light at a pixel; returns the offset of the noise, sqrt of their squares.
+def weigh(image: Image, planes: int, scale: float, v: int, u: int, radius: float, weight: Array) -> None:
+    """Write each plane's `weight` (4,), their sum 1, for a light of about `radius` px at a pixel.
 
-    Planes count by how far they stand out of a ring, as the best filter does for equal noise. Where some are saturated
-    and others that stand out well are not, only those others count: they still tell a core from its halo.
+    Planes count by how far they stand out of a ring, as in the best filter for equal noise.
     """
     weight[:] = 0.0
     if planes == 1:
         weight[0] = 1.0
-        return 1.0
-    pitch = 2 if planes == 4 else 1
-    full = np.zeros(4)
-    reach = max(int(0.7 * radius), pitch)
+        return
     for p in range(planes):
-        core, count = 0.0, 0
-        for y in range(max(v - reach, 0), min(v + reach + 1, image.shape[0]), max(reach, 1)):
-            for x in range(max(u - reach, 0), min(u + reach + 1, image.shape[1]), max(reach, 1)):
-                value = scale * sample(image, planes, p, y, x)
-                core += value
-                full[p] += value >= clipped
-                count += 1
-        dark, n = 0.0, 0
-        for k in range(0, _RING, 2):
-            x, y = int(u + 3.0 * radius * _COS[k]), int(v + 3.0 * radius * _SIN[k])
-            if 0 <= x < image.shape[1] and 0 <= y < image.shape[0]:
-                dark += scale * sample(image, planes, p, y, x)
-                n += 1
-        weight[p] = max(core / count - dark / max(n, 1), 0.0)
-    if full.max() > 0.0:
-        _prefer_unsaturated(weight, full, planes)
+        dark = ring_mean(image, planes, scale, p, v, u, 3.0 * radius)
+        weight[p] = max(core_mean(image, planes, scale, p, v, u) - dark, 0.0)
     total = weight.sum()
     if total <= 0.0:
-        weight[:planes] = 1.0 / planes
-        total = 1.0
+        weight[:planes], total = 1.0, float(planes)
     weight /= total
-    return float(np.sqrt((weight**2).sum()))
 
 
 @njit(cache=True)
-def _prefer_unsaturated(weight: Array, full: Array, planes: int) -> None:
-    least = 9.0
+def weigh_clipped(
+    image: Image, planes: int, scale: float, v: int, u: int, least: float, largest: float, weight: Array
+) -> float:
+    """The same for a saturated light: only the planes in which it is smallest count. Returns its radius there, or 0.
+
+    A saturated core in its halo is small where its colour is weak: the red of a blue lamp. The radius is that of the first
+    ring at half height over the ring three times as wide; a plane must stand out by `least`.
+    """
+    weight[:] = 0.0
+    radii = np.full(4, np.inf)
     for p in range(planes):
-        if weight[p] > 30.0:
-            least = min(least, full[p])
+        top, radius = core_mean(image, planes, scale, p, v, u), 3.0
+        while radius < largest:
+            dark = ring_mean(image, planes, scale, p, v, u, 3.0 * radius)
+            if top - dark >= least and ring_mean(image, planes, scale, p, v, u, radius) <= 0.5 * (top + dark):
+                radii[p] = radius
+                break
+            radius *= 1.25
+    smallest = radii.min()
+    if not np.isfinite(smallest):
+        return 0.0
     for p in range(planes):
-        if weight[p] <= 30.0 or full[p] > least:
-            weight[p] = 0.0
-        else:
-            weight[p] = 1.0
+        weight[p] = 1.0 if radii[p] <= 1.3 * smallest else 0.0
+    weight /= weight.sum()
+    return float(smallest)
+
+
+@njit(cache=True)
+def core_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int) -> float:
+    """Mean of a plane over 3 x 3 of its samples around a pixel."""
+    pitch = 2 if planes == 4 else 1
+    total, count = 0.0, 0
+    for y in range(max(v - pitch, 0), min(v + pitch + 1, image.shape[0]), pitch):
+        for x in range(max(u - pitch, 0), min(u + pitch + 1, image.shape[1]), pitch):
+            total += sample(image, planes, p, y, x)
+            count += 1
+    return scale * total / count
+
+
+@njit(cache=True)
+def ring_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float) -> float:
+    """Mean of the middle half of twelve samples of a plane on a circle around a pixel; 0 where it is outside."""
+    ordered, count = np.empty(12), 0
+    for k in range(0, _RING, 2):
+        x, y = int(u + radius * _COS[k] + 0.5), int(v + radius * _SIN[k] + 0.5)
+        if 0 <= x < image.shape[1] and 0 <= y < image.shape[0]:
+            count = _insert(ordered, count, sample(image, planes, p, y, x))
+    if count == 0:
+        return 0.0
+    quarter = count // 4
+    return float(scale * ordered[quarter : count - quarter].mean())
+
+
+@njit(cache=True)
+def _insert(ordered: Array, count: int, value: float) -> int:
+    """Insert into the first `count` of the sorted values; returns the new count."""
+    k = count
+    while k > 0 and ordered[k - 1] > value:
+        ordered[k] = ordered[k - 1]
+        k -= 1
+    ordered[k] = value
+    return count + 1
 
 
 @njit(cache=True)
@@ -116,29 +148,24 @@ def cut(
 
 
 @njit(cache=True)
-def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> float:
-    """Level of the ring of `radius` around a sample, whose slope is taken out of the patch: what a neighbour's halo adds.
+def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tuple[float, float]:
+    """Level and spread (1 sigma) of the ring of `radius` around a sample, whose slope is taken out of the patch.
 
-    The mean of the middle half of the ring, and the slope by least squares of what lies within Tukey's fences.
+    The slope is what a neighbour's halo adds: by least squares, from opposite samples within Tukey's fences. The level is
+    the mean of the middle half, the spread from the quartiles.
     """
     columns, rows = int(where[COLUMNS]), int(where[ROWS])
     values, ordered = np.empty(_RING), np.empty(_RING)
     count = 0
     for k in range(_RING):
         a, b = int(np.floor(x + radius * _COS[k] + 0.5)), int(np.floor(y + radius * _SIN[k] + 0.5))
-        inside = 0 <= a < columns and 0 <= b < rows
-        values[k] = patch[b, a] if inside else np.nan
-        if inside:
-            n = count
-            while n > 0 and ordered[n - 1] > patch[b, a]:
-                ordered[n] = ordered[n - 1]
-                n -= 1
-            ordered[n] = patch[b, a]
-            count += 1
+        values[k] = np.nan
+        if 0 <= a < columns and 0 <= b < rows:
+            values[k] = patch[b, a]
+            count = _insert(ordered, count, patch[b, a])
     if count == 0:
-        return 0.0
+        return 0.0, 0.0
     quarter = count // 4
-    level = ordered[quarter : count - quarter].mean()
     low, high = ordered[quarter], ordered[count - 1 - quarter]
     fence = 1.5 * (high - low)
     gx, gy, opposite = 0.0, 0.0, 0
@@ -149,12 +176,19 @@ def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> fl
             gy += (a - b) * _SIN[k]
             opposite += 1
     if opposite < _RING // 3:
-        return level
-    gx, gy = gx / (opposite * radius), gy / (opposite * radius)
-    for i in range(rows):
-        for j in range(columns):
-            patch[i, j] -= gx * (j - x) + gy * (i - y)
-    return level
+        return ordered[quarter : count - quarter].mean(), (high - low) / 1.35
+    gx, gy = gx / opposite, gy / opposite
+    count = 0
+    for k in range(_RING):
+        if not np.isnan(values[k]):
+            count = _insert(ordered, count, values[k] - gx * _COS[k] - gy * _SIN[k])
+    level, spread = ordered[quarter : count - quarter].mean(), (ordered[count - 1 - quarter] - ordered[quarter]) / 1.35
+    gx, gy = gx / radius, gy / radius
+    if max(abs(gx), abs(gy)) * radius > 0.3 * spread:
+        for i in range(rows):
+            for j in range(columns):
+                patch[i, j] -= gx * (j - x) + gy * (i - y)
+    return level, spread
 
 
 @njit(cache=True)
@@ -178,17 +212,17 @@ def rim_noise(patch: Array, where: Array) -> float:
 
 
 @njit(cache=True)
-def filter_snr(patch: Array, where: Array, x: float, y: float, width: float, level: float, noise: float) -> float:
-    """Signal-to-noise ratio under a Gaussian window of `width` samples."""
+def filtered(patch: Array, where: Array, x: float, y: float, width: float, level: float) -> tuple[float, float]:
+    """Amplitude of a Gaussian of `width` samples at a place, and how many samples' worth of averaging is in it."""
     reach = int(np.ceil(2.5 * width))
-    total, power = 0.0, 0.0
+    total, power = 0.0, 1e-12
     for i in range(max(int(y) - reach, 0), min(int(y) + reach + 2, int(where[ROWS]))):
+        b = np.exp(-0.5 * (i - y) ** 2 / (width * width))
         for j in range(max(int(x) - reach, 0), min(int(x) + reach + 2, int(where[COLUMNS]))):
-            a, b = j - x, i - y
-            window = np.exp(-0.5 * (a * a + b * b) / (width * width))
+            window = b * np.exp(-0.5 * (j - x) ** 2 / (width * width))
             total += window * (patch[i, j] - level)
             power += window * window
-    return float(total / (noise * np.sqrt(max(power, 1e-12))))
+    return total / power, power
 
 
 @njit(cache=True)
