@@ -44,7 +44,7 @@ class Scan:
         self.raw_sigma, self.sigma = np.zeros((hb, wb), np.float32), np.zeros((hb, wb), np.float32)
         self.raw_shared = np.zeros((hb, -(-wb // tiles.SPARSE)), np.float32)
         self.seen = np.zeros((h, w), np.uint8)
-        self.found = np.empty((h * w, 3))
+        self.found = np.empty((h * w, 4))
         self.spots = np.empty((config.max_spots, kernels.COLUMNS))
         self.whole = np.array([[0, h, 0, w]])
         self.shared = 1.0

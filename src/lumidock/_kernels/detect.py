@@ -12,8 +12,8 @@ from lumidock._kernels import patch, tiles
 from lumidock._kernels.patch import Window
 from lumidock.datatypes import Array, Image, Indices
 
-U, V, RADIUS, FLUX, SNR, ELONGATION, FILL, LEVEL, SATURATED, CUT, HALO, P_LIGHT, VAR_UU, VAR_UV, VAR_VV = range(15)
-COLUMNS = 15
+U, V, RADIUS, FLUX, SNR, ELONGATION, FILL, LEVEL, SATURATED, CUT, HALO, CORE, P_LIGHT, VAR_UU, VAR_UV, VAR_VV = range(16)
+COLUMNS = 16
 # what may be tuned, see `DetectConfig`
 (
     CONTRAST,
@@ -67,8 +67,9 @@ def search(
     count = 0
     clipped = q[CLIPPED] / scale
     for k in range(len(rects)):
-        count += tiles.candidates(peak, level, sigma, q[CONTRAST], clipped, rects[k], seen, found[count:])
-    order = _strongest(peak, found, count, most[0])
+        count += tiles.candidates(peak, level, sigma, q[CONTRAST] * np.sqrt(shared), clipped, rects[k], seen, found[count:])
+    count = _most_outstanding(found, count, most[0])
+    order = _brightest_first(image, found, count)
     seen[:] = 0  # from here on: tiles of spots
     n, work = 0, most[1]
     side = patch.SIDE + 16
@@ -86,11 +87,10 @@ def search(
             continue
         noise = max(scale * sigma[i // tiles.BLOCK, j // tiles.BLOCK], q[MIN_NOISE])
         base = scale * level[i // tiles.BLOCK, j // tiles.BLOCK]
-        status = _measure(image, planes, scale, peak, i, j, base, noise, shared, q, window, spots, n)
+        v, u = int(found[k, 2]), int(found[k, 3])
+        status = _measure(image, planes, scale, peak, i, j, v, u, base, noise, shared, q, window, seen, spots, n)
         work -= status >= 0
-        if status > 0:
-            _own(seen, spots[n])
-            n += 1
+        n += status > 0
     for k in range(n):
         spots[k, P_LIGHT] = _lamp_probability(spots[k], q)
     _dim_glints(spots, n, q)
@@ -98,27 +98,39 @@ def search(
 
 
 @njit(cache=True)
-def _strongest(peak: Image, found: Array, count: int, most: int) -> Indices:
-    """The candidates, brightest first and of those the most outstanding; of too many the most outstanding."""
-    if count > most:
-        least = np.sort(found[:count, 2])[count - most]
-        kept = 0
-        for k in range(count):
-            if found[k, 2] >= least and kept < most:
-                found[kept] = found[k]
-                kept += 1
-        count = kept
-    key = np.empty(count)
+def _most_outstanding(found: Array, count: int, most: int) -> int:
+    """Move the `most` candidates that stand out most to the front; returns how many there are."""
+    if count <= most:
+        return count
+    least = np.sort(found[:count, 2])[count - most]
+    kept = 0
     for k in range(count):
-        key[k] = -(float(peak[int(found[k, 0]), int(found[k, 1])]) + 1e-6 * min(found[k, 2], 1e5))
-    return np.argsort(key, kind="mergesort")
+        if found[k, 2] >= least and kept < most:
+            found[kept] = found[k]
+            kept += 1
+    return kept
 
 
 @njit(cache=True)
-def _brightest(image: Image, i: int, j: int) -> tuple[int, int, bool]:
-    """Row and column of a tile's brightest pixel, and whether none beyond the tile's border next to it is brighter.
+def _brightest_first(image: Image, found: Array, count: int) -> Indices:
+    """Order of the candidates by their brightest pixel, whose row and column go to the last columns of `found`.
 
-    Pixels count by their largest channel, and among equals by the sum of all.
+    A candidate that has a brighter pixel right beyond its tile's border is no peak and left out.
+    """
+    key = np.empty(count)
+    peaks = 0
+    for k in range(count):
+        found[k, 2], found[k, 3], rank = _brightest(image, int(found[k, 0]), int(found[k, 1]))
+        key[k] = -rank
+        peaks += rank > 0
+    return np.argsort(key, kind="mergesort")[:peaks]
+
+
+@njit(cache=True)
+def _brightest(image: Image, i: int, j: int) -> tuple[int, int, int]:
+    """Row, column and rank of a tile's brightest pixel; rank 0 where one next to it in another tile is brighter.
+
+    Pixels rank by their largest channel, and among equals by the sum of all.
     """
     best, row, column = -1, 0, 0
     top, left = i * tiles.TILE_PX, j * tiles.TILE_PX
@@ -130,8 +142,8 @@ def _brightest(image: Image, i: int, j: int) -> tuple[int, int, bool]:
     for v in range(max(row - 1, 0), min(row + 2, image.shape[0])):
         for u in range(max(column - 1, 0), min(column + 2, image.shape[1])):
             if _rank(image, v, u) > best:
-                return row, column, False
-    return row, column, True
+                return row, column, 0
+    return row, column, best
 
 
 @njit(cache=True)
@@ -139,7 +151,7 @@ def _rank(image: Image, v: int, u: int) -> int:
     if image.shape[2] == 1:
         return int(image[v, u, 0])
     a, b, c = int(image[v, u, 0]), int(image[v, u, 1]), int(image[v, u, 2])
-    return 1024 * max(a, b, c) + a + b + c
+    return 262144 * max(a, b, c) + a + b + c
 
 
 @njit(cache=True)
@@ -167,18 +179,18 @@ def _measure(
     peak: Image,
     i: int,
     j: int,
+    v: int,
+    u: int,
     base: float,
     noise: float,
     shared: float,
     q: Array,
     window: Window,
+    seen: Image,
     spots: Array,
     n: int,
 ) -> int:
     """Measure the spot of one candidate tile into `spots[n]`: 1 if there is one, 0 if not, -1 if it was cheap to say so."""
-    v, u, alone = _brightest(image, i, j)
-    if not alone:
-        return -1
     weight, where, start = np.zeros(4), np.zeros(5), np.zeros(2, np.int64)
     radius, clipped = 0.0, scale * peak[i, j] >= q[CLIPPED]
     if clipped:
@@ -197,15 +209,18 @@ def _measure(
         ring = 0.9 * reach / where[patch.UNIT]
         ground[0], spread = patch.flatten(window[0], where, float(start[0]), float(start[1]), ring)
         ground[1] = max(patch.rim_noise(window[0], where), 0.5 * expected, q[MIN_NOISE] * expected / noise)
-        ground[2] = np.sqrt(max(spread**2 - 2.0 * ground[1] ** 2, 0.0))
+        ground[2] = 0.0 if clipped else np.sqrt(max(spread**2 - 2.0 * ground[1] ** 2, 0.0))
         if turn == 0 and not clipped:
             width = max(_FILTER_PX / where[patch.UNIT], 0.7)
             if _snr(window[0], where, float(start[0]), float(start[1]), width, ground, shared) < 0.5 * q[MIN_SNR]:
                 return -1
+        if clipped:
+            patch.smooth(window[0], where)
         part = _level(image, planes, window, where, start, ground[0], q, spots, n)
         sums = window[3]
         if part == 0.0:
-            if reach >= 3.5 * q[MAX_RADIUS_PX] or sums[patch.OPEN] == 0.0:
+            if sums[patch.OPEN] == 0.0 or reach >= 3.5 * q[MAX_RADIUS_PX]:
+                _own_plateau(image, planes, scale, weight, v, u, reach, q, window, where, start, seen)
                 return 0
             reach = min(2.0 * reach, 3.5 * q[MAX_RADIUS_PX])
             continue
@@ -216,6 +231,10 @@ def _measure(
         reach = wanted
     if part == 0.0:
         return 0
+    _own(seen, window[1], where, start)
+    spots[n, CORE] = 0.0
+    for p in range(planes):
+        spots[n, CORE] += patch.core_mean(image, planes, scale, p, v, u) / planes
     return int(_describe(image, planes, scale, weight, window, where, start, u, v, part, ground, shared, q, spots, n))
 
 
@@ -269,7 +288,10 @@ def _level(
             window, where, image, start[0], start[1], floor + share * (top - floor), q[CLIPPED], k + 1
         )
         sums = window[3]
-        if sums[patch.OPEN] > 0.0 or _holds_another(window[1], where, k + 1, spots, n):
+        if _holds_another(window[1], where, k + 1, spots, n):
+            sums[patch.OPEN] = 0.0  # a wider window does not help
+            continue
+        if sums[patch.OPEN] > 0.0:
             continue
         elongation, fill = patch.shape(sums)
         if again or sums[patch.N] < 12.0 or (elongation > q[MIN_ELONGATION] and fill > q[MIN_FILL]):
@@ -406,15 +428,44 @@ def _is_known(spots: Array, n: int) -> bool:
 
 
 @njit(cache=True)
-def _own(seen: Image, spot: Array) -> None:
-    """Mark the tiles whose centre a spot covers, and the one that it is in: nobody looks there again."""
-    t = tiles.TILE_PX
-    reach = spot[RADIUS]
-    for i in range(max(int((spot[V] - reach) / t), 0), min(int((spot[V] + reach) / t) + 1, seen.shape[0])):
-        for j in range(max(int((spot[U] - reach) / t), 0), min(int((spot[U] + reach) / t) + 1, seen.shape[1])):
-            inside = np.hypot((i + 0.5) * t - spot[V], (j + 0.5) * t - spot[U]) <= reach
-            if inside or (i == int((spot[V] + 0.5) / t) and j == int((spot[U] + 0.5) / t)):
-                seen[i, j] = 1
+def _own(seen: Image, stamp: Array, where: Array, start: Indices) -> None:
+    """Mark the tiles that the grown region touches: nobody looks there again."""
+    mark = stamp[start[1], start[0]]
+    for y in range(int(where[patch.ROWS])):
+        i = int(where[patch.TOP] + y * where[patch.UNIT]) // tiles.TILE_PX
+        for x in range(int(where[patch.COLUMNS])):
+            if stamp[y, x] == mark:
+                seen[i, int(where[patch.LEFT] + x * where[patch.UNIT]) // tiles.TILE_PX] = 1
+
+
+@njit(cache=True)
+def _own_plateau(
+    image: Image,
+    planes: int,
+    scale: float,
+    weight: Array,
+    v: int,
+    u: int,
+    reach: float,
+    q: Array,
+    window: Window,
+    where: Array,
+    start: Indices,
+    seen: Image,
+) -> None:
+    """Mark the tiles of what is too large to be a light, as far as it is as bright as here in its weakest plane."""
+    darkest, least = 0, 1e9
+    for p in range(planes):
+        mean = patch.core_mean(image, planes, scale, p, v, u)
+        if mean <= least:
+            darkest, least = p, mean
+    weight[:] = 0.0
+    weight[darkest] = 1.0
+    patch.cut(image, planes, scale, weight, v, u, reach, window[0], where)
+    start[0], start[1] = _index(u, where[0], where[2], where[3]), _index(v, where[1], where[2], where[4])
+    window[1][:] = 0
+    patch.grow(window, where, image, start[0], start[1], _LEVELS[-1] * least, q[CLIPPED], 1)
+    _own(seen, window[1], where, start)
 
 
 @njit(cache=True)
@@ -446,6 +497,7 @@ def _dim_glints(spots: Array, n: int, q: Array) -> None:
         for m in range(n):
             near = np.hypot(spots[k, U] - spots[m, U], spots[k, V] - spots[m, V]) < q[GLINT_RADII] * spots[m, RADIUS]
             weaker = spots[m, FLUX] > q[GLINT_RATIO] * spots[k, FLUX]
-            if m != k and near and weaker and before[m] > q[GLINT_TRUST] * before[k]:
+            halo = m < k and spots[k, SATURATED] > 0.0 and spots[k, CORE] < 0.9 * spots[m, CORE]
+            if m != k and near and (weaker or halo) and before[m] > q[GLINT_TRUST] * before[k]:
                 spots[k, P_LIGHT] = max(0.1 * before[k], 0.02)
                 break

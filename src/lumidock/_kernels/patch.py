@@ -97,7 +97,10 @@ def core_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int) -
 
 @njit(cache=True)
 def ring_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float) -> float:
-    """Mean of the middle half of twelve samples of a plane on a circle around a pixel; 0 where it is outside."""
+    """Mean of the second quarter of twelve samples of a plane on a circle around a pixel, 0 where it is outside.
+
+    So nearly half of the circle may lie on something brighter.
+    """
     ordered, count = np.empty(12), 0
     for k in range(0, _RING, 2):
         x, y = int(u + radius * _COS[k] + 0.5), int(v + radius * _SIN[k] + 0.5)
@@ -105,8 +108,7 @@ def ring_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int, r
             count = _insert(ordered, count, sample(image, planes, p, y, x))
     if count == 0:
         return 0.0
-    quarter = count // 4
-    return float(scale * ordered[quarter : count - quarter].mean())
+    return float(scale * ordered[count // 4 : count // 2 + 1].mean())
 
 
 @njit(cache=True)
@@ -189,6 +191,27 @@ def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tu
             for j in range(columns):
                 patch[i, j] -= gx * (j - x) + gy * (i - y)
     return level, spread
+
+
+@njit(cache=True)
+def smooth(patch: Array, where: Array) -> None:
+    """Average with the neighbours by 1 2 1 in either direction: a clipped core is torn by noise, and by interlacing."""
+    columns, rows = int(where[COLUMNS]), int(where[ROWS])
+    for i in range(rows):
+        before = patch[i, 0]
+        for j in range(columns - 1):
+            here = patch[i, j]
+            patch[i, j] = 0.25 * (before + 2.0 * here + patch[i, j + 1])
+            before = here
+        patch[i, columns - 1] = 0.25 * (before + 3.0 * patch[i, columns - 1])
+    above = patch[0, :columns].copy()
+    for i in range(rows - 1):
+        for j in range(columns):
+            here = patch[i, j]
+            patch[i, j] = 0.25 * (above[j] + 2.0 * here + patch[i + 1, j])
+            above[j] = here
+    for j in range(columns):
+        patch[rows - 1, j] = 0.25 * (above[j] + 3.0 * patch[rows - 1, j])
 
 
 @njit(cache=True)
