@@ -135,7 +135,7 @@ class DetectConfig(Section):
     """Light detection of the default method; figures without a source were set on rendered approaches."""
 
     contrast: PositiveFloat = 1.9  # sigmas by which a tile's largest pixel must clear that of the tiles around
-    min_snr: PositiveFloat = 7.8  # of a spot; a small one's is that of a matched filter, in whose place noise reaches 7
+    min_snr: PositiveFloat = 6.0  # of a spot; a small one's is that of a matched filter
     min_noise: PositiveFloat = 0.7  # steps of the sensor; rounding alone leaves 0.3
     ring_px: PositiveFloat = 8.0  # radius of the ring that is a small spot's background; larger spots take 3 radii
     max_spots: PositiveInt = 100  # in a frame; the strongest are kept
@@ -153,6 +153,10 @@ class DetectConfig(Section):
     glint_radii: PositiveFloat = 3.6  # a spot this near, in radii of the stronger one, ...
     glint_ratio: PositiveFloat = 2.2  # ... with this many times less flux is a glint, ...
     glint_trust: PositiveFloat = 0.5  # ... if the stronger looks like a lamp to this share of how much itself does
+    lamps: PositiveFloat = 16.0  # of a kind in view; more spots than that of one kind share the probability
+    prominent: Fraction = 0.1  # of the brightest; for spots with more flux a crowd says nothing
+    kin: PositiveFloat = 3.0  # spots are of a kind whose fluxes are within this factor
+    flux_range: PositiveFloat = 300.0  # of the lamps in one view; a spot fainter than that by the brightest is none
 
 
 class LabelConfig(Section):

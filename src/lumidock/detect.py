@@ -38,10 +38,13 @@ class Scan:
         self.channels = 3 if frame.image.ndim == 3 else 1
         self.planes = 4 if frame.encoding.startswith("bayer") else self.channels
         self.scale = 1.0 if dtype == np.uint8 else _SIXTEEN
-        self.peak = np.zeros((h, w), dtype)
-        self.line = np.empty(2 * (width + 2 * tiles.TILE_PX) * self.channels, dtype)
-        self.raw_level, self.level = np.zeros((hb, wb), dtype), np.zeros((hb, wb), np.float32)
+        maps = 1 if self.planes == 1 else 3
+        self.peak = np.zeros((maps, h, w), dtype)
+        self.line = np.empty((2, (width + 2 * tiles.TILE_PX) * self.channels), dtype)
+        self.raw_level, self.level = np.zeros((maps, hb, wb), dtype), np.zeros((maps, hb, wb), np.float32)
         self.raw_sigma, self.sigma = np.zeros((hb, wb), np.float32), np.zeros((hb, wb), np.float32)
+        self.raw_plane = np.zeros((maps, hb, -(-wb // tiles.SPARSE)), np.float32)
+        self.spread = np.ones(maps)
         self.raw_shared = np.zeros((hb, -(-wb // tiles.SPARSE)), np.float32)
         self.seen = np.zeros((h, w), np.uint8)
         self.found = np.empty((h * w, 4))
@@ -54,7 +57,7 @@ class Scan:
 
 def _parameters(config: DetectConfig, longer_side: int, least_noise: float) -> Array:
     """The numbers that the kernel takes, in its order."""
-    q = np.empty(kernels.MIN_NOISE + 1)
+    q = np.empty(kernels.PARAMETERS)
     q[kernels.CONTRAST], q[kernels.MIN_SNR], q[kernels.RING_PX] = config.contrast, config.min_snr, config.ring_px
     q[kernels.MAX_RADIUS_PX] = max(config.max_radius * longer_side, 2.0 * config.ring_px)
     q[kernels.MIN_RADIUS_PX], q[kernels.SMALL_PX] = config.min_radius_px, config.small_px
@@ -63,6 +66,8 @@ def _parameters(config: DetectConfig, longer_side: int, least_noise: float) -> A
     q[kernels.SATURATED_PX], q[kernels.CUT_SHARE] = config.saturated_px, config.cut
     q[kernels.GLINT_RADII], q[kernels.GLINT_RATIO] = config.glint_radii, config.glint_ratio
     q[kernels.GLINT_TRUST], q[kernels.CLIPPED], q[kernels.MIN_NOISE] = config.glint_trust, _SATURATED, least_noise
+    q[kernels.PROMINENT] = config.prominent
+    q[kernels.KIN], q[kernels.LAMPS], q[kernels.RANGE] = config.kin, config.lamps, config.flux_range
     return q
 
 
@@ -83,15 +88,20 @@ def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None) -> Dete
 def _look(rows: Array, scan: Scan, rect: Indices) -> None:
     """Bring the tiles of whole rows of blocks up to date, and what goes with them."""
     blocks = int(rect[0]) // tiles.BLOCK, -(-int(rect[1]) // tiles.BLOCK)
-    tiles.refresh(rows, scan.channels, rect, scan.peak, scan.line)
-    tiles.noise(rows, scan.channels, blocks, scan.raw_sigma, scan.raw_shared)
-    tiles.levels(scan.peak, blocks, scan.raw_level)
-    tiles.smoothed(scan.raw_level, scan.level)
+    tiles.refresh(rows, scan.planes, rect, scan.peak, scan.line)
+    tiles.noise(rows, scan.channels, blocks, scan.raw_sigma, scan.raw_plane, scan.raw_shared)
+    for peak, raw, level in zip(scan.peak, scan.raw_level, scan.level, strict=True):
+        tiles.levels(peak, blocks, raw)
+        tiles.smoothed(raw, level)
     tiles.smoothed(scan.raw_sigma, scan.sigma)
     np.maximum(scan.sigma, scan.least_noise / scan.scale, out=scan.sigma)
-    if scan.planes != 4:
-        ratio = float(np.median(scan.raw_shared)) / max(float(np.median(scan.raw_sigma)), 0.5)
-        scan.shared = min(max(ratio**4, 1.0), _MOST_SHARED)
+    if scan.planes == 4:
+        return
+    here = np.median(scan.raw_plane.reshape(len(scan.peak), -1), axis=1)
+    typical = max(float(np.median(scan.raw_sigma)), 0.5)
+    scan.spread[:] = np.clip(here / typical, 0.7, 2.0)
+    ratio = float(np.median(scan.raw_shared)) / max(float(here[len(here) // 2]), 0.5)
+    scan.shared = min(max(ratio**4, 1.0), _MOST_SHARED)
 
 
 def _search(frame: Frame, rows: Array, scan: Scan, rects: Indices, config: DetectConfig) -> Detections:
@@ -103,6 +113,7 @@ def _search(frame: Frame, rows: Array, scan: Scan, rects: Indices, config: Detec
         scan.peak,
         scan.level,
         scan.sigma,
+        scan.spread,
         scan.shared,
         rects,
         (config.max_candidates, config.max_measured),

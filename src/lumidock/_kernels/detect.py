@@ -33,7 +33,12 @@ COLUMNS = 16
     GLINT_TRUST,
     CLIPPED,
     MIN_NOISE,
-) = range(17)
+    KIN,
+    LAMPS,
+    RANGE,
+    PROMINENT,
+) = range(21)
+PARAMETERS = 21
 _LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out, until it is round and alone
 _MAX_TILES = 20  # a light is not wider
 _FILTER_PX = 1.2  # width of the window that judges a small spot ...
@@ -50,6 +55,7 @@ def search(
     peak: Image,
     level: Array,
     sigma: Array,
+    spread: Array,
     shared: float,
     rects: Indices,
     most: tuple[int, int],
@@ -60,16 +66,20 @@ def search(
 ) -> int:
     """Write the spots of the tiles in `rects` (n, 4) to `spots` (N, COLUMNS), the strongest first; returns how many.
 
-    `image` (H, W, C); `planes` 1, 3 or, for a mosaic, 4; `scale` makes 8-bit levels of its samples. `peak` (h, w) of
-    its tiles, `level` and `sigma` of its blocks in samples, see `tiles`. `most`: candidates and measurements.
+    `image` (H, W, C); `planes` 1, 3 or, for a mosaic, 4; `scale` makes 8-bit levels of its samples. `peak` (P, h, w)
+    of its tiles, `level` (P, h, w) and `sigma` (h, w) of its blocks in samples, `spread` (P,), see `tiles`. `most`: candidates and measurements.
     """
     seen[:] = 0
     count = 0
     clipped = q[CLIPPED] / scale
-    for k in range(len(rects)):
-        count += tiles.candidates(peak, level, sigma, q[CONTRAST] * np.sqrt(shared), clipped, rects[k], seen, found[count:])
+    contrast = q[CONTRAST] * shared**0.25
+    for p in range(len(peak)):
+        for k in range(len(rects)):
+            more = tiles.candidates(peak[p], level[p], sigma, spread[p], contrast, clipped, rects[k], seen, found[count:])
+            found[count : count + more, 3] = p
+            count += more
     count = _most_outstanding(found, count, most[0])
-    order = _brightest_first(image, found, count)
+    order = _brightest_first(image, planes, found, count)
     seen[:] = 0  # from here on: tiles of spots
     n, work = 0, most[1]
     side = patch.SIDE + 16
@@ -86,14 +96,14 @@ def search(
         if seen[i, j]:
             continue
         noise = max(scale * sigma[i // tiles.BLOCK, j // tiles.BLOCK], q[MIN_NOISE])
-        base = scale * level[i // tiles.BLOCK, j // tiles.BLOCK]
         v, u = int(found[k, 2]), int(found[k, 3])
-        status = _measure(image, planes, scale, peak, i, j, v, u, base, noise, shared, q, window, seen, spots, n)
+        status = _measure(image, planes, scale, peak, i, j, v, u, level, noise, shared, q, window, seen, spots, n)
         work -= status >= 0
         n += status > 0
     for k in range(n):
         spots[k, P_LIGHT] = _lamp_probability(spots[k], q)
     _dim_glints(spots, n, q)
+    _dim_small_fry(spots, n, q)
     return n
 
 
@@ -112,60 +122,69 @@ def _most_outstanding(found: Array, count: int, most: int) -> int:
 
 
 @njit(cache=True)
-def _brightest_first(image: Image, found: Array, count: int) -> Indices:
-    """Order of the candidates by their brightest pixel, whose row and column go to the last columns of `found`.
+def _brightest_first(image: Image, planes: int, found: Array, count: int) -> Indices:
+    """Order of the candidates by their brightest pixel, whose row and column go to columns 2 and 3 of `found`.
 
     A candidate that has a brighter pixel right beyond its tile's border is no peak and left out.
     """
     key = np.empty(count)
     peaks = 0
     for k in range(count):
-        found[k, 2], found[k, 3], rank = _brightest(image, int(found[k, 0]), int(found[k, 1]))
+        i, j, p = int(found[k, 0]), int(found[k, 1]), int(found[k, 3])
+        found[k, 2], found[k, 3], rank = _brightest(image, planes, p, i, j)
         key[k] = -rank
         peaks += rank > 0
     return np.argsort(key, kind="mergesort")[:peaks]
 
 
 @njit(cache=True)
-def _brightest(image: Image, i: int, j: int) -> tuple[int, int, int]:
-    """Row, column and rank of a tile's brightest pixel; rank 0 where one next to it in another tile is brighter.
-
-    Pixels rank by their largest channel, and among equals by the sum of all.
-    """
+def _brightest(image: Image, planes: int, p: int, i: int, j: int) -> tuple[int, int, int]:
+    """Row, column and rank of a tile's brightest pixel of a map; rank 0 where one next to it is brighter."""
     best, row, column = -1, 0, 0
     top, left = i * tiles.TILE_PX, j * tiles.TILE_PX
     for v in range(top, min(top + tiles.TILE_PX, image.shape[0])):
         for u in range(left, min(left + tiles.TILE_PX, image.shape[1])):
-            rank = _rank(image, v, u)
+            rank = _rank(image, planes, p, v, u)
             if rank > best:
                 best, row, column = rank, v, u
-    for v in range(max(row - 1, 0), min(row + 2, image.shape[0])):
-        for u in range(max(column - 1, 0), min(column + 2, image.shape[1])):
-            if _rank(image, v, u) > best:
+    reach = 2 if planes == 4 else 1
+    for v in range(max(row - reach, 0), min(row + reach + 1, image.shape[0])):
+        for u in range(max(column - reach, 0), min(column + reach + 1, image.shape[1])):
+            if _rank(image, planes, p, v, u) > best:
                 return row, column, 0
     return row, column, best
 
 
 @njit(cache=True)
-def _rank(image: Image, v: int, u: int) -> int:
-    if image.shape[2] == 1:
+def _rank(image: Image, planes: int, p: int, v: int, u: int) -> int:
+    """Order of a pixel in map `p`: by its value there, and among equals by all channels, which tell a saturated core."""
+    if planes == 1:
         return int(image[v, u, 0])
-    a, b, c = int(image[v, u, 0]), int(image[v, u, 1]), int(image[v, u, 2])
-    return 262144 * max(a, b, c) + a + b + c
+    if planes == 4:
+        return int(image[v, u, 0]) if (v & 1) + (u & 1) == p else -1
+    return 1024 * int(image[v, u, p]) + int(image[v, u, 0]) + int(image[v, u, 1]) + int(image[v, u, 2])
 
 
 @njit(cache=True)
-def _extent(peak: Image, i: int, j: int, base: float) -> float:
-    """Radius px that the tiles give a spot at half height: of its narrower side, half a tile at least."""
-    half = 0.5 * (float(peak[i, j]) + base)
+def _extent(peak: Image, i: int, j: int, level: Array) -> float:
+    """Radius px that the tiles give a spot at half height: of its narrower side, half a tile at least.
+
+    In the plane in which it stands out most.
+    """
+    p, most = 0, -1e9
+    for k in range(len(peak)):
+        over = float(peak[k, i, j]) - level[k, i // tiles.BLOCK, j // tiles.BLOCK]
+        if over > most:
+            p, most = k, over
+    half = float(peak[p, i, j]) - 0.5 * most
     width, height = 1, 1
     for step in (-1, 1):
         k = 1
-        while k < _MAX_TILES and 0 <= j + step * k < peak.shape[1] and peak[i, j + step * k] > half:
+        while k < _MAX_TILES and 0 <= j + step * k < peak.shape[2] and peak[p, i, j + step * k] > half:
             k += 1
         width += k - 1
         k = 1
-        while k < _MAX_TILES and 0 <= i + step * k < peak.shape[0] and peak[i + step * k, j] > half:
+        while k < _MAX_TILES and 0 <= i + step * k < peak.shape[1] and peak[p, i + step * k, j] > half:
             k += 1
         height += k - 1
     return 0.5 * tiles.TILE_PX * min(width, height)
@@ -181,7 +200,7 @@ def _measure(
     j: int,
     v: int,
     u: int,
-    base: float,
+    level: Array,
     noise: float,
     shared: float,
     q: Array,
@@ -192,13 +211,13 @@ def _measure(
 ) -> int:
     """Measure the spot of one candidate tile into `spots[n]`: 1 if there is one, 0 if not, -1 if it was cheap to say so."""
     weight, where, start = np.zeros(4), np.zeros(5), np.zeros(2, np.int64)
-    radius, clipped = 0.0, scale * peak[i, j] >= q[CLIPPED]
+    radius, clipped = 0.0, scale * peak[:, i, j].max() >= q[CLIPPED]
     if clipped:
         radius = patch.weigh_clipped(image, planes, scale, v, u, _LEAST_STEP, q[MAX_RADIUS_PX], weight)
         if radius == 0.0:
             return -1
     else:
-        radius = min(_extent(peak, i, j, base / scale), q[MAX_RADIUS_PX])
+        radius = min(_extent(peak, i, j, level), q[MAX_RADIUS_PX])
         patch.weigh(image, planes, scale, v, u, radius, weight)
     expected = noise * np.sqrt((weight**2).sum())
     reach = min(max(3.5 * radius, 1.5 * q[RING_PX]), 3.5 * q[MAX_RADIUS_PX])
@@ -501,3 +520,28 @@ def _dim_glints(spots: Array, n: int, q: Array) -> None:
             if m != k and near and (weaker or halo) and before[m] > q[GLINT_TRUST] * before[k]:
                 spots[k, P_LIGHT] = max(0.1 * before[k], 0.02)
                 break
+
+
+@njit(cache=True)
+def _dim_small_fry(spots: Array, n: int, q: Array) -> None:
+    """Make less of spots that are many of a kind, or faint beside the lamps in view.
+
+    A dock has a dozen or two lamps, of fluxes within a few hundred of each other; a wall or a cloud of snow has crowds.
+    """
+    before = spots[:n, P_LIGHT].copy()
+    brightest = 0.0
+    for k in range(n):
+        if before[k] > 0.5:
+            brightest = max(brightest, spots[k, FLUX])
+    for k in range(n):
+        alike = 0.0
+        for m in range(n):
+            if q[KIN] * spots[m, FLUX] > spots[k, FLUX] > spots[m, FLUX] / q[KIN]:
+                alike += before[m]
+        crowd = 1.0
+        if spots[k, FLUX] < q[PROMINENT] * brightest:
+            crowd = min(1.0, q[LAMPS] / max(alike, 1.0))
+        dim = 1.0
+        if brightest > 0.0 and spots[k, FLUX] > 0.0:
+            dim = _logistic(np.log(spots[k, FLUX] * q[RANGE] / brightest))
+        spots[k, P_LIGHT] = max(before[k] * crowd * dim, 0.02)

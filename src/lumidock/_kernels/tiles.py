@@ -1,6 +1,6 @@
 """The one pass over a frame: largest value of every 8 x 8 tile, local noise, and the tiles worth a closer look.
 
-Rows are (H, W * channels) of an unsigned type; a tile's value is that of its brightest sample of any channel.
+Rows are (H, W * channels) of an unsigned type.
 """
 
 from __future__ import annotations
@@ -21,32 +21,40 @@ _HIGH = np.array([1, 3, 5, 7, 2, 3, 6, 7, 2, 6, 4, 5, 6, 7, 4, 5, 2, 4, 6])
 
 
 @njit(cache=True)
-def refresh(rows: Image, channels: int, rect: Indices, peak: Image, line: Image) -> int:
-    """Write the largest value of each tile of `rect` (first and last row, first and last column) into `peak` (h, w).
+def refresh(rows: Image, planes: int, rect: Indices, peak: Image, line: Image) -> int:
+    """Write the largest values of each tile of `rect` (first and last row, first and last column) into `peak` (P, h, w).
 
-    `line` (2 W + 16 channels) * channels is scratch. Returns the largest value of all.
+    One map for mono; for `planes` 3 one for each channel; for a mosaic, `planes` 4, the corners of its 2 x 2 cell that
+    stand on one diagonal are one map if they are alike, so that there are three: a light in one colour must not hide
+    behind the background of another. `line` (2, n) is scratch, n = (W + 16) times the channels. Returns the largest value.
     """
-    height, width = rows.shape
+    height = len(rows)
+    channels = 3 if planes == 3 else 1
     span = TILE_PX * channels
-    left, right = rect[2] * span, min(rect[3] * span, width)
+    left, right = rect[2] * span, min(rect[3] * span, rows.shape[1])
     n, padded = right - left, (rect[3] - rect[2]) * span
     highest = 0
+    line[:, n:padded] = 0
     for i in range(rect[0], rect[1]):
         top, bottom = i * TILE_PX, min((i + 1) * TILE_PX, height)
         # read in the order of memory: eight rows at a time alone would keep the memory waiting
         for v in range(top, bottom):
             highest = max(highest, _largest(rows[v, left:right]))
+        part = rows[top:bottom, left:right]
+        if planes == 4:
+            _max_of_rows(part[0::2], line[0, :n])
+            _max_of_rows(part[1::2] if bottom - top > 1 else part, line[1, :n])
+            _largest_of_mosaic(line[0, :padded], line[1, :padded], peak[:, i, rect[2] : rect[3]])
+            continue
         if bottom == top + TILE_PX:
-            _max_of_eight(rows[top:bottom, left:right], line[:n])
+            _max_of_eight(part, line[0, :n])
         else:
-            line[:n] = rows[top, left:right]
-            for v in range(top + 1, bottom):
-                _keep_larger(line[:n], rows[v, left:right])
-        line[n:padded] = 0
+            _max_of_rows(part, line[0, :n])
         if channels == 1:
-            _largest_of_tiles(line[:padded], peak[i, rect[2] : rect[3]])
+            _largest_of_tiles(line[0, :padded], peak[0, i, rect[2] : rect[3]])
         else:
-            _largest_of_wide_tiles(line[:padded], line[len(line) // 2 :], peak[i, rect[2] : rect[3]])
+            _largest_of_wide_tiles(line[0, :padded], line[1, :padded], peak[:, i, rect[2] : rect[3]])
+        line[:, n:padded] = 0
     return highest
 
 
@@ -66,9 +74,21 @@ def _max_of_eight(r: Image, line: Image) -> None:
 
 
 @njit(cache=True)
-def _keep_larger(line: Image, row: Image) -> None:
-    for x in range(len(line)):
-        line[x] = max(line[x], row[x])
+def _max_of_rows(rows: Image, line: Image) -> None:
+    if len(rows) == 4:
+        a, b, c, d = rows[0], rows[1], rows[2], rows[3]
+        for x in range(len(line)):
+            line[x] = max(max(a[x], b[x]), max(c[x], d[x]))
+        return
+    line[:] = rows[0]
+    for v in range(1, len(rows)):
+        _larger(line, rows[v], line)
+
+
+@njit(cache=True)
+def _larger(a: Image, b: Image, out: Image) -> None:
+    for x in range(len(out)):
+        out[x] = max(a[x], b[x])
 
 
 @njit(cache=True)
@@ -82,9 +102,18 @@ def _largest_of_tiles(line: Image, out: Image) -> None:
 
 
 @njit(cache=True)
-def _larger(a: Image, b: Image, out: Image) -> None:
-    for x in range(len(out)):
-        out[x] = max(a[x], b[x])
+def _largest_of_mosaic(even: Image, odd: Image, out: Image) -> None:
+    """The largest of the four corners of a cell, the second and third as one: the greens of most mosaics.
+
+    Where the greens are the first and fourth, the maps mix colours, and lose only sharpness.
+    """
+    for j in range(out.shape[1]):
+        x = TILE_PX * j
+        out[0, j] = max(max(even[x], even[x + 2]), max(even[x + 4], even[x + 6]))
+        a = max(max(even[x + 1], even[x + 3]), max(even[x + 5], even[x + 7]))
+        b = max(max(odd[x], odd[x + 2]), max(odd[x + 4], odd[x + 6]))
+        out[1, j] = max(a, b)
+        out[2, j] = max(max(odd[x + 1], odd[x + 3]), max(odd[x + 5], odd[x + 7]))
 
 
 @njit(cache=True)
@@ -94,18 +123,18 @@ def _largest_of_wide_tiles(line: Image, scratch: Image, out: Image) -> None:
     _larger(line[:n], line[12:], scratch[:n])
     _larger(scratch[: n - 6], scratch[6:n], line[: n - 6])
     _larger(line[: n - 9], line[3 : n - 6], scratch[: n - 9])
-    for j in range(len(out)):
+    for j in range(out.shape[1]):
         x = 3 * TILE_PX * j
-        out[j] = max(scratch[x], max(scratch[x + 1], scratch[x + 2]))
+        out[0, j], out[1, j], out[2, j] = scratch[x], scratch[x + 1], scratch[x + 2]
 
 
 @njit(cache=True)
-def noise(rows: Image, channels: int, blocks: tuple[int, int], sigma: Array, shared: Array) -> None:
+def noise(rows: Image, channels: int, blocks: tuple[int, int], sigma: Array, plane: Array, shared: Array) -> None:
     """Write the noise of the rows of blocks from `blocks[0]` to `blocks[1]`: 1 sigma of a sample, `sigma` (h, w).
 
-    `shared` (h, w / 4): how much more the sums of eight neighbours vary than independent samples would make them; demosaicing
-    and JPEG share noise. One row of pixels speaks for a row of blocks, by second differences, which no slope reaches, of
-    every other pixel, which a mosaic does not.
+    `plane` (P, h, w / 4) is that of each channel, or of even and odd columns, and `shared` (h, w / 4) what the sums of eight
+    neighbours make of it, over the root of eight; demosaicing and JPEG share noise. One row of pixels speaks for a row of
+    blocks, by second differences, which no slope reaches, of every other pixel, which a mosaic does not.
     """
     samples = rows.shape[1]
     for b in range(blocks[0], blocks[1]):
@@ -117,6 +146,8 @@ def noise(rows: Image, channels: int, blocks: tuple[int, int], sigma: Array, sha
             sigma[b, k] = _SIGMA * _second_difference(part, 2 * channels)
             if k % SPARSE == 0:
                 shared[b, k // SPARSE] = _SIGMA * _second_difference_of_sums(part, channels)
+                for p in range(len(plane)):
+                    plane[p, b, k // SPARSE] = _SIGMA * _second_difference(part[p % channels :: channels], 2)
 
 
 @njit(cache=True)
@@ -203,32 +234,42 @@ def _exchange(a: Image, b: Image) -> None:
 
 @njit(cache=True)
 def candidates(
-    peak: Image, level: Array, sigma: Array, contrast: float, clipped: float, rect: Indices, seen: Image, found: Array
+    peak: Image,
+    level: Array,
+    sigma: Array,
+    spread: float,
+    contrast: float,
+    clipped: float,
+    rect: Indices,
+    seen: Image,
+    found: Array,
 ) -> int:
-    """Write the tiles of `rect` that may hold a light's peak to `found` (n, 3): row, column, sigmas over the background.
+    """Write the tiles of `rect` that may hold a light's peak to `found` (n, 4): row, column, sigmas over the background.
 
-    Such a tile clears its background by `contrast` sigmas; no two neighbours on opposite sides are brighter together,
-    as on a slope, and next to it or a few tiles away they are darker by a margin, as on a halo they are not. Tiles that
-    are `seen` (h, w) are left out, and the others become it. Returns how many there are, also of those that `found` has no room for.
+    Of one plane: `peak` (h, w), `level` of its blocks, and `spread` times `sigma` for its noise. Such a tile clears its
+    background by `contrast` sigmas; no two neighbours on opposite sides are brighter together, as on a slope, and next to
+    it or a few tiles away they are darker by a margin, as on a halo they are not. Tiles that are `seen` (h, w) are left
+    out, and the others become it. Returns how many there are.
     """
     count, least = 0, np.empty(peak.shape[1], peak.dtype)
     for i in range(rect[0], rect[1]):
         b = i // BLOCK
         if i == rect[0] or i % BLOCK == 0:
-            for j in range(rect[2], rect[3]):
-                least[j] = min(np.ceil(level[b, j // BLOCK] + contrast * sigma[b, j // BLOCK]), clipped)
+            for k in range(rect[2] // BLOCK, (rect[3] + BLOCK - 1) // BLOCK):
+                value = min(np.ceil(level[b, k] + contrast * spread * sigma[b, k]), clipped)
+                for j in range(max(k * BLOCK, rect[2]), min((k + 1) * BLOCK, rect[3])):
+                    least[j] = value
         if not _any_reaches(peak[i, rect[2] : rect[3]], least[rect[2] : rect[3]]):
             continue
         for j in range(rect[2], rect[3]):
-            if peak[i, j] < least[j] or seen[i, j]:
+            if peak[i, j] < least[j] or seen[i, j] or count == len(found):
                 continue
-            here = sigma[b, j // BLOCK]
+            here = spread * sigma[b, j // BLOCK]
             if not _stands_out(peak, i, j, 1.5 * contrast * here, clipped):
                 continue
             seen[i, j] = 1
-            if count < len(found):
-                found[count, 0], found[count, 1] = i, j
-                found[count, 2] = (peak[i, j] - level[b, j // BLOCK]) / here
+            found[count, 0], found[count, 1] = i, j
+            found[count, 2] = (peak[i, j] - level[b, j // BLOCK]) / here
             count += 1
     return count
 
