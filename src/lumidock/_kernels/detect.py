@@ -152,7 +152,27 @@ def _brightest(image: Image, planes: int, p: int, i: int, j: int) -> tuple[int, 
         for u in range(max(column - reach, 0), min(column + reach + 1, image.shape[1])):
             if _rank(image, planes, p, v, u) > best:
                 return row, column, 0
+    for _ in range(2):  # to the middle of a plateau
+        row = _middle_of_run(image, planes, p, row, column, 1, 0, best)
+        column = _middle_of_run(image, planes, p, row, column, 0, 1, best)
     return row, column, best
+
+
+@njit(cache=True)
+def _middle_of_run(image: Image, planes: int, p: int, v: int, u: int, dv: int, du: int, rank: int) -> int:
+    """Row or column in the middle of the run of pixels of at least this rank through a pixel, along one of both."""
+    pitch = 2 if planes == 4 else 1
+    ends = [0, 0]
+    for side in range(2):
+        sign = 1 if side else -1
+        k = pitch
+        while k < 64 * pitch:
+            y, x = v + sign * dv * k, u + sign * du * k
+            if not (0 <= y < image.shape[0] and 0 <= x < image.shape[1]) or _rank(image, planes, p, y, x) < rank:
+                break
+            k += pitch
+        ends[side] = sign * (k - pitch)
+    return (v if dv else u) + (ends[0] + ends[1]) // (2 * pitch) * pitch
 
 
 @njit(cache=True)
@@ -370,6 +390,7 @@ def _describe(
     spot[ELONGATION], spot[FILL] = patch.shape(sums)
     spot[SATURATED], spot[CUT] = sums[patch.CLIPPED] / area, sums[patch.EDGE] / area
     spread = _unresolved(sums, q, unit)
+    skew_u, skew_v = _skew(image, window, where, start, level + 0.5 * (top - level), q, unit)
     if unit > pitch:  # again, as finely as the room allows
         patch.cut(image, planes, scale, weight, v, u, 1.6 * radius + 3.0, window[0], where)
         unit = where[patch.UNIT]
@@ -385,18 +406,22 @@ def _describe(
     middle = 0.5 * (unit / pitch - 1.0) * 0.0
     center[0] = where[patch.LEFT] + unit * (start[0] + center[0]) + shift_u + middle
     center[1] = where[patch.TOP] + unit * (start[1] + center[1]) + shift_v + middle
+    fitted = False
     if radius <= q[SMALL_PX] and sums[patch.EDGE] == 0.0:
         sample_noise = noise if planes < 4 else max(noise / np.sqrt((weight**2).sum()), q[MIN_NOISE])
         width = patch.fit(
             image, planes, scale, weight, center, max(radius / 1.18, 0.8), sample_noise, q[SIGNAL_NOISE], q[CLIPPED], cov
         )
         if width > 0.0:
+            fitted = True
             cov *= shared
             spot[RADIUS] = 1.18 * width
     spot[U], spot[V] = center
     floor_px = q[FLOOR_PX] ** 2 + (q[SATURATED_PX] ** 2 if spot[SATURATED] > 0.0 else 0.0)
     if sums[patch.EDGE] > 0.0:
         floor_px += (q[CUT_SHARE] * radius) ** 2
+    if not fitted:
+        spread = spread[0] + skew_u * skew_u, spread[1] + skew_u * skew_v, spread[2] + skew_v * skew_v
     spot[VAR_UU] = cov[0] + floor_px + spread[0]
     spot[VAR_UV] = cov[1] + spread[1]
     spot[VAR_VV] = cov[2] + floor_px + spread[2]
@@ -425,6 +450,22 @@ def _plane_shift(weight: Array, planes: int) -> tuple[float, float]:
     # the weight of a plane goes with its share of the light, its part of the sum with the square
     total = (weight**2).sum()
     return float((weight[1] ** 2 + weight[3] ** 2) / total), float((weight[2] ** 2 + weight[3] ** 2) / total)
+
+
+@njit(cache=True)
+def _skew(
+    image: Image, window: Window, where: Array, start: Indices, level: float, q: Array, unit: float
+) -> tuple[float, float]:
+    """How far the centre moves, px, when the spot is cut out higher: what an uneven halo or a glint does to it."""
+    sums = window[3]
+    x, y = sums[patch.WX] / sums[patch.W], sums[patch.WY] / sums[patch.W]
+    kept = sums.copy()
+    patch.grow(window, where, image, start[0], start[1], level, q[CLIPPED], len(_LEVELS) + 3)
+    skew = (0.0, 0.0)
+    if sums[patch.N] >= 4.0:
+        skew = unit * (sums[patch.WX] / sums[patch.W] - x), unit * (sums[patch.WY] / sums[patch.W] - y)
+    sums[:] = kept
+    return skew
 
 
 @njit(cache=True)

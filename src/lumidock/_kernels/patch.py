@@ -359,7 +359,7 @@ def fit(
             z[i, j] = scale * mixed if scale * most < clipped else np.nan
     u, v, s = center[0], center[1], width
     amplitude, ground = np.zeros(4), np.zeros(4)
-    chi2, dof, dx, dy = 0.0, 0.0, 1.0, 1.0
+    dx, dy = 1.0, 1.0
     S = np.zeros((3, 3))
     for turn in range(_FIT_ROUNDS):
         for j in range(right - left):
@@ -367,9 +367,7 @@ def fit(
         for i in range(bottom - top):
             ey[i] = np.exp(-0.5 * ((top + i - v) / s) ** 2)
         _amplitudes(z, ex, ey, left, top, parts, noise, signal_noise, turn > 0, amplitude, ground)
-        chi2, dof, right_side = _normal_equations(
-            z, ex, ey, left, top, parts, noise, signal_noise, amplitude, ground, u, v, s, S
-        )
+        right_side = _normal_equations(z, ex, ey, left, top, parts, noise, signal_noise, amplitude, ground, u, v, s, S)
         step, solved = _solve(S, right_side)
         if not solved:
             return 0.0
@@ -386,9 +384,43 @@ def fit(
     if not solved:
         return 0.0
     center[0], center[1] = u, v
-    misfit = (_PRIOR_DOF + chi2) / (_PRIOR_DOF + max(dof, 0.0))
+    misfit = _odd_misfit(z, ex, ey, left, top, parts, noise, signal_noise, amplitude, ground, u, v)
     cov[0], cov[1], cov[2] = inverse[0] * misfit, inverse[1] * misfit, inverse[2] * misfit
     return s
+
+
+@njit(cache=True)
+def _odd_misfit(
+    z: Array,
+    ex: Array,
+    ey: Array,
+    left: int,
+    top: int,
+    parts: int,
+    noise: float,
+    signal_noise: float,
+    amplitude: Array,
+    ground: Array,
+    u: float,
+    v: float,
+) -> float:
+    """How much more the residuals differ between opposite sides than noise would: what is even displaces nothing."""
+    center_i, center_j = int(np.floor(v + 0.5)) - top, int(np.floor(u + 0.5)) - left
+    total, pairs = 0.0, 0
+    for i in range(center_i + 1):
+        for j in range(len(ex)):
+            k, m = 2 * center_i - i, 2 * center_j - j
+            if not (i < k or j < m) or k >= len(ey) or m < 0 or m >= len(ex):
+                continue
+            a, b = z[i, j], z[k, m]
+            if np.isnan(a) or np.isnan(b):
+                continue
+            p = ((top + i) & 1) * 2 + ((left + j) & 1) if parts == 4 else 0
+            g, h = amplitude[p] * ex[j] * ey[i], amplitude[p] * ex[m] * ey[k]
+            odd = a - g - b + h
+            total += odd * odd / (2.0 * noise * noise + signal_noise * (max(g, 0.0) + max(h, 0.0)))
+            pairs += 1
+    return (_PRIOR_DOF + total) / (_PRIOR_DOF + pairs)
 
 
 @njit(cache=True)
@@ -447,11 +479,10 @@ def _normal_equations(
     v: float,
     s: float,
     S: Array,
-) -> tuple[float, float, Array]:
-    """Schur complement `S` (3, 3) of position and width, and its right side; also chi-square and degrees of freedom."""
+) -> Array:
+    """Schur complement `S` (3, 3) of position and width; returns its right side (3,)."""
     M, B, right_side = np.zeros((4, 3)), np.zeros((4, 2, 3)), np.zeros(3)
     S[:] = 0.0
-    chi2, dof = 0.0, -3.0 - 2.0 * parts
     for i in range(len(ey)):
         b = (top + i - v) / s
         for j in range(len(ex)):
@@ -465,8 +496,6 @@ def _normal_equations(
             r = value - ground[p] - A * g
             scaled = A * g / s
             j0, j1, j2 = scaled * a, scaled * b, scaled * (a * a + b * b)
-            chi2 += w * r * r
-            dof += 1.0
             S[0, 0] += w * j0 * j0
             S[0, 1] += w * j0 * j1
             S[0, 2] += w * j0 * j2
@@ -494,7 +523,7 @@ def _normal_equations(
                     + M[p, 0] * B[p, 1, k] * B[p, 1, m]
                 ) / det
     S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
-    return chi2, dof, right_side
+    return right_side
 
 
 @njit(cache=True)
