@@ -146,9 +146,10 @@ class DetectConfig(Section):
     small_px: PositiveFloat = 3.2  # up to this radius the centre comes from the fit of a Gaussian
     min_elongation: Fraction = 0.6  # shorter over longer axis of a round spot; below, its level is raised
     min_fill: Fraction = 0.85  # area over that of the ellipse with the same moments
-    signal_noise: PositiveFloat = 0.05  # variance of a pixel per grey level of signal: shot noise, mosaic, JPEG
-    floor_px: PositiveFloat = 0.03  # 1 sigma of a centre that has no noise
-    saturated_px: PositiveFloat = 0.04  # added to it, squared, where the core is saturated
+    signal_noise: PositiveFloat = 0.01  # variance of a pixel per grey level of signal: shot noise, mosaic, JPEG
+    floor_px: PositiveFloat = 0.02  # 1 sigma of a centre that has no noise
+    coarse_px: PositiveFloat = 0.05  # the same where blue or red is brightest: JPEG has fewer samples of them
+    saturated_px: PositiveFloat = 0.03  # added to it, squared, where the core is saturated
     cut: Fraction = 0.3  # 1 sigma, of the radius, of a centre whose spot the picture's edge cuts
     glint_radii: PositiveFloat = 3.6  # a spot this near, in radii of the stronger one, ...
     glint_ratio: PositiveFloat = 2.2  # ... with this many times less flux is a glint, ...

@@ -45,12 +45,12 @@ class Scan:
         self.raw_sigma, self.sigma = np.zeros((hb, wb), np.float32), np.zeros((hb, wb), np.float32)
         self.raw_plane = np.zeros((maps, hb, -(-wb // tiles.SPARSE)), np.float32)
         self.spread = np.ones(maps)
-        self.raw_shared = np.zeros((hb, -(-wb // tiles.SPARSE)), np.float32)
+        self.raw_shared = np.zeros((maps, hb, -(-wb // tiles.SPARSE)), np.float32)
         self.seen = np.zeros((h, w), np.uint8)
         self.found = np.empty((h * w, 4))
         self.spots = np.empty((config.max_spots, kernels.COLUMNS))
         self.whole = np.array([[0, h, 0, w]])
-        self.shared = 1.0
+        self.shared = np.ones(4)
         self.least_noise = config.min_noise * (1.0 if dtype == np.uint8 else _TWELVE_BITS * _SIXTEEN)
         self.q = _parameters(config, max(height, width), self.least_noise)
 
@@ -66,7 +66,7 @@ def _parameters(config: DetectConfig, longer_side: int, least_noise: float) -> A
     q[kernels.SATURATED_PX], q[kernels.CUT_SHARE] = config.saturated_px, config.cut
     q[kernels.GLINT_RADII], q[kernels.GLINT_RATIO] = config.glint_radii, config.glint_ratio
     q[kernels.GLINT_TRUST], q[kernels.CLIPPED], q[kernels.MIN_NOISE] = config.glint_trust, _SATURATED, least_noise
-    q[kernels.PROMINENT] = config.prominent
+    q[kernels.PROMINENT], q[kernels.COARSE_PX] = config.prominent, config.coarse_px
     q[kernels.KIN], q[kernels.LAMPS], q[kernels.RANGE] = config.kin, config.lamps, config.flux_range
     return q
 
@@ -100,8 +100,8 @@ def _look(rows: Array, scan: Scan, rect: Indices) -> None:
     here = np.median(scan.raw_plane.reshape(len(scan.peak), -1), axis=1)
     typical = max(float(np.median(scan.raw_sigma)), 0.5)
     scan.spread[:] = np.clip(here / typical, 0.7, 2.0)
-    ratio = float(np.median(scan.raw_shared)) / max(float(here[len(here) // 2]), 0.5)
-    scan.shared = min(max(ratio**4, 1.0), _MOST_SHARED)
+    of_sums = np.median(scan.raw_shared.reshape(len(scan.peak), -1), axis=1)
+    scan.shared[: len(here)] = np.clip((of_sums / np.maximum(here, 0.5)) ** 2, 1.0, _MOST_SHARED)
 
 
 def _search(frame: Frame, rows: Array, scan: Scan, rects: Indices, config: DetectConfig) -> Detections:

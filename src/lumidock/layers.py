@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
+from lumidock._kernels.colors import colors
 from lumidock.config import LabelConfig
-from lumidock.datatypes import Array, Detections, Frame, Image
+from lumidock.datatypes import Array, Detections, Frame, Indices
 
-_SATURATED = 250
+_CLIPPED = 250.0  # of 255
+_OF_LETTER = {"b": 0, "g": 1, "r": 2}
+_LINEAR = np.empty(0, np.float32)  # raw mosaics are
 
 
 def label(frame: Frame, detections: Detections, config: LabelConfig) -> Detections:
@@ -17,50 +21,49 @@ def label(frame: Frame, detections: Detections, config: LabelConfig) -> Detectio
 
     A saturated core is white whatever the lamp, so the ring around it is asked.
     """
-    unknown = np.full(len(detections), np.nan)
-    if frame.image.ndim == 2:
-        return replace(detections, p_rear=unknown)
-    linear = (255.0 * (np.arange(256) / 255.0) ** config.gamma).astype(np.float32)
-    spots = zip(detections.uv, detections.radius_px, strict=True)
-    p_rear = [_rear_probability(frame.image, linear, uv, radius, config) for uv, radius in spots]
-    return replace(detections, p_rear=np.array(p_rear, float))
+    mosaic = frame.encoding.startswith("bayer")
+    if not len(detections) or (frame.image.ndim == 2 and not mosaic):
+        return replace(detections, p_rear=np.full(len(detections), np.nan))
+    signal, sigma = np.empty((len(detections), 3)), np.empty((len(detections), 3))
+    image = frame.image[:, :, None] if mosaic else frame.image
+    colors(
+        image,
+        4 if mosaic else 3,
+        _order(frame.encoding),
+        1.0 if image.dtype == np.uint8 else 255.0 / 65535.0,
+        _LINEAR if mosaic or image.dtype != np.uint8 else _linear(config.gamma),
+        _CLIPPED,
+        detections.uv,
+        detections.radius_px,
+        config.ring,
+        config.clear_px,
+        config.min_reach_px,
+        signal,
+        sigma,
+    )
+    return replace(detections, p_rear=_from_signal(signal, sigma, config))
 
 
-def _rear_probability(image: Image, linear: Array, uv: Array, radius: float, config: LabelConfig) -> float:
-    """P(rear) of the spot at `uv` (2,) px, NaN where its colour is not above the noise."""
-    outer = config.ring[0] * radius + config.ring[1]
-    window, distance = _window(image, uv, 2.0 * outer + 2.0)
-    value = window.max(axis=2)
-    ring = distance <= max(radius, config.min_reach_px)
-    if (value[ring] >= _SATURATED).any():
-        ring = (distance >= radius + config.clear_px) & (distance <= outer) & (value < _SATURATED)
-    rim = distance > 1.5 * outer
-    if not ring.any() or not rim.any():
-        return float("nan")
-    light, dark = linear[window[ring]], linear[window[rim]]
-    signal = light.mean(axis=0) - np.median(dark, axis=0)
-    sigma = dark.std(axis=0) / np.sqrt(len(light))
-    return _from_signal(signal, sigma + 1e-3, config)
+@cache
+def _linear(gamma: float) -> Array:
+    """Light (256,) of a grey level, of 255."""
+    return (255.0 * (np.arange(256) / 255.0) ** gamma).astype(np.float32)
 
 
-def _window(image: Image, uv: Array, reach: float) -> tuple[Image, Array]:
-    """The part (V, U, 3) of an image within `reach` px of `uv`, and each pixel's distance (V, U) from there.
-
-    Large parts are thinned out to about 32 samples a side.
-    """
-    u, v = float(uv[0]), float(uv[1])
-    step = 1 + int(2.0 * reach) // 32
-    rows = np.arange(max(int(v - reach), 0), min(int(v + reach) + 2, image.shape[0]), step)
-    columns = np.arange(max(int(u - reach), 0), min(int(u + reach) + 2, image.shape[1]), step)
-    return image[np.ix_(rows, columns)], np.hypot(columns[None] - u, rows[:, None] - v)
+@cache
+def _order(encoding: str) -> Indices:
+    """Colour of each channel, or of each corner of a mosaic's cell: B, G, R = 0, 1, 2."""
+    letters = encoding.removeprefix("bayer_")[:4] if encoding.startswith("bayer") else "bgr"
+    return np.array([_OF_LETTER[letter] for letter in letters], np.int64)
 
 
-def _from_signal(signal: Array, sigma: Array, config: LabelConfig) -> float:
-    """P(rear) from the linear light (3,) of B, G, R over the background and its error (3,)."""
-    other = 1 + int(signal[2] > signal[1])
-    if max(signal[0] / sigma[0], signal[other] / sigma[other]) < config.min_signal:
-        return float("nan")
-    blue, rest = (max(signal[i], sigma[i]) for i in (0, other))
-    error = np.hypot(sigma[0] / blue, sigma[other] / rest)
+def _from_signal(signal: Array, sigma: Array, config: LabelConfig) -> Array:
+    """P(rear) (N,) from the linear light (N, 3) of B, G, R over the background and its error; NaN where it is too weak."""
+    other = np.maximum(signal[:, 1], signal[:, 2])
+    other_sigma = np.where(signal[:, 2] > signal[:, 1], sigma[:, 2], sigma[:, 1])
+    blue, rest = np.maximum(signal[:, 0], sigma[:, 0]), np.maximum(other, other_sigma)
+    error = np.hypot(sigma[:, 0] / blue, other_sigma / rest)
     odds = (np.log(blue / rest) - np.log(config.blue_ratio)) / np.hypot(config.softness, error)
-    return float(np.clip(1.0 / (1.0 + np.exp(-odds)), config.limit, 1.0 - config.limit))
+    p_rear = np.clip(1.0 / (1.0 + np.exp(-odds)), config.limit, 1.0 - config.limit)
+    strong = np.maximum(signal[:, 0] / sigma[:, 0], other / other_sigma) >= config.min_signal
+    return np.where(strong, p_rear, np.nan)

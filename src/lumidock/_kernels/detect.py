@@ -37,8 +37,9 @@ COLUMNS = 16
     LAMPS,
     RANGE,
     PROMINENT,
-) = range(21)
-PARAMETERS = 21
+    COARSE_PX,
+) = range(22)
+PARAMETERS = 22
 _LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out, until it is round and alone
 _MAX_TILES = 20  # a light is not wider
 _FILTER_PX = 1.2  # width of the window that judges a small spot ...
@@ -56,7 +57,7 @@ def search(
     level: Array,
     sigma: Array,
     spread: Array,
-    shared: float,
+    shared_by_plane: Array,
     rects: Indices,
     most: tuple[int, int],
     q: Array,
@@ -72,7 +73,7 @@ def search(
     seen[:] = 0
     count = 0
     clipped = q[CLIPPED] / scale
-    contrast = q[CONTRAST] * shared**0.25
+    contrast = q[CONTRAST] * np.sqrt(shared_by_plane.max())
     for p in range(len(peak)):
         for k in range(len(rects)):
             more = tiles.candidates(peak[p], level[p], sigma, spread[p], contrast, clipped, rects[k], seen, found[count:])
@@ -97,7 +98,7 @@ def search(
             continue
         noise = max(scale * sigma[i // tiles.BLOCK, j // tiles.BLOCK], q[MIN_NOISE])
         v, u = int(found[k, 2]), int(found[k, 3])
-        status = _measure(image, planes, scale, peak, i, j, v, u, level, noise, shared, q, window, seen, spots, n)
+        status = _measure(image, planes, scale, peak, i, j, v, u, level, noise, shared_by_plane, q, window, seen, spots, n)
         work -= status >= 0
         n += status > 0
     for k in range(n):
@@ -222,7 +223,7 @@ def _measure(
     u: int,
     level: Array,
     noise: float,
-    shared: float,
+    shared_by_plane: Array,
     q: Array,
     window: Window,
     seen: Image,
@@ -239,6 +240,7 @@ def _measure(
     else:
         radius = min(_extent(peak, i, j, level), q[MAX_RADIUS_PX])
         patch.weigh(image, planes, scale, v, u, radius, weight)
+    shared = (weight**2 * shared_by_plane).sum() / (weight**2).sum()
     expected = noise * np.sqrt((weight**2).sum())
     reach = min(max(3.5 * radius, 1.5 * q[RING_PX]), 3.5 * q[MAX_RADIUS_PX])
     part, ground = 0.0, np.zeros(3)  # level, noise and texture of the surroundings
@@ -417,7 +419,8 @@ def _describe(
             cov *= shared
             spot[RADIUS] = 1.18 * width
     spot[U], spot[V] = center
-    floor_px = q[FLOOR_PX] ** 2 + (q[SATURATED_PX] ** 2 if spot[SATURATED] > 0.0 else 0.0)
+    coarse = planes == 3 and weight[1] < max(weight[0], weight[2])
+    floor_px = (q[COARSE_PX] if coarse else q[FLOOR_PX]) ** 2 + (q[SATURATED_PX] ** 2 if spot[SATURATED] > 0.0 else 0.0)
     if sums[patch.EDGE] > 0.0:
         floor_px += (q[CUT_SHARE] * radius) ** 2
     if not fitted:

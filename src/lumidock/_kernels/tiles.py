@@ -132,8 +132,8 @@ def _largest_of_wide_tiles(line: Image, scratch: Image, out: Image) -> None:
 def noise(rows: Image, channels: int, blocks: tuple[int, int], sigma: Array, plane: Array, shared: Array) -> None:
     """Write the noise of the rows of blocks from `blocks[0]` to `blocks[1]`: 1 sigma of a sample, `sigma` (h, w).
 
-    `plane` (P, h, w / 4) is that of each channel, or of even and odd columns, and `shared` (h, w / 4) what the sums of eight
-    neighbours make of it, over the root of eight; demosaicing and JPEG share noise. One row of pixels speaks for a row of
+    `plane` (P, h, w / 4) is that of each channel and `shared` (P, h, w / 4) what the sums of eight neighbours make of it,
+    over the root of eight; demosaicing and JPEG share noise. One row of pixels speaks for a row of
     blocks, by second differences, which no slope reaches, of every other pixel, which a mosaic does not.
     """
     samples = rows.shape[1]
@@ -145,9 +145,10 @@ def noise(rows: Image, channels: int, blocks: tuple[int, int], sigma: Array, pla
             part = row[low : min(low + n, samples)]
             sigma[b, k] = _SIGMA * _second_difference(part, 2 * channels)
             if k % SPARSE == 0:
-                shared[b, k // SPARSE] = _SIGMA * _second_difference_of_sums(part, channels)
                 for p in range(len(plane)):
-                    plane[p, b, k // SPARSE] = _SIGMA * _second_difference(part[p % channels :: channels], 2)
+                    own = part[p % channels :: channels]
+                    plane[p, b, k // SPARSE] = _SIGMA * _second_difference(own, 2)
+                    shared[p, b, k // SPARSE] = _SIGMA * _second_difference_of_sums(own)
 
 
 @njit(cache=True)
@@ -164,16 +165,16 @@ def _second_difference(row: Image, step: int) -> float:
 
 
 @njit(cache=True)
-def _second_difference_of_sums(row: Image, channels: int) -> float:
-    """The same of sums of `TILE_PX` neighbours of one channel, over the root of their number."""
-    count = len(row) // (TILE_PX * channels)
+def _second_difference_of_sums(row: Image) -> float:
+    """The same of sums of `TILE_PX` neighbours, over the root of their number."""
+    count = len(row) // TILE_PX
     if count < 3:
         return 0.0
     total, first, second = 0.0, 0.0, 0.0
     for k in range(count):
         s = np.int32(0)
         for x in range(TILE_PX):
-            s += np.int32(row[(k * TILE_PX + x) * channels + channels // 2])
+            s += np.int32(row[k * TILE_PX + x])
         if k > 1:
             total += abs(first - 2.0 * second + s)
         first, second = second, float(s)

@@ -1,0 +1,113 @@
+"""Colour of each spot: the light of blue, green and red over its background, read where the sensor is not saturated."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from lumidock.datatypes import Array, Image, Indices
+
+_SAMPLES = 24  # a side of a window at most
+_CLIP_ROUNDS, _CLIP = 2, 2.5  # outliers of the background, in sigmas
+
+
+@njit(cache=True)
+def colors(
+    image: Image,
+    planes: int,
+    order: Indices,
+    scale: float,
+    linear: Array,
+    clipped: float,
+    uv: Array,
+    radius: Array,
+    ring: tuple[float, float],
+    clear_px: float,
+    least_reach_px: float,
+    signal: Array,
+    sigma: Array,
+) -> None:
+    """Write `signal` (N, 3), light of B, G, R over the background, and its error `sigma` (N, 3) of the spots `uv` (N, 2).
+
+    `order` (4,): colour of each plane. `linear` (256,) undoes the camera's gamma. A saturated core is white whatever the
+    lamp, so the ring around it is asked, from `clear_px` beyond its edge to `ring` radii + px. NaN where there is none.
+    """
+    pitch = 2 if planes == 4 else 1
+    value = np.empty(4)
+    rim = np.empty((3, (_SAMPLES + 4) ** 2))
+    for n in range(len(uv)):
+        u, v = uv[n]
+        outer = ring[0] * radius[n] + ring[1]
+        reach = 2.0 * outer + 2.0
+        step = pitch * (1 + int(2.0 * reach) // (_SAMPLES * pitch))
+        inner = max(radius[n], least_reach_px)
+        burnt = _is_burnt(image, planes, scale, clipped, u, v, inner)
+        low, high = (radius[n] + clear_px, outer) if burnt else (0.0, inner)
+        fine = max(step // 2 // pitch * pitch, pitch) if high < 8.0 else step
+        total, count, dark = np.zeros(3), np.zeros(3), 0
+        for y in range(max(int(v - high), 0) // pitch * pitch, min(int(v + high) + 2, image.shape[0] - pitch + 1), fine):
+            for x in range(max(int(u - high), 0) // pitch * pitch, min(int(u + high) + 2, image.shape[1] - pitch + 1), fine):
+                distance = np.hypot(x + 0.5 * (pitch - 1) - u, y + 0.5 * (pitch - 1) - v)
+                if low <= distance <= high and _read(image, planes, scale, y, x, value) < clipped:
+                    for p in range(planes):
+                        total[order[p]] += _light(value[p], linear)
+                        count[order[p]] += 1.0
+        for y in range(max(int(v - reach), 0) // pitch * pitch, min(int(v + reach) + 2, image.shape[0] - pitch + 1), step):
+            for x in range(max(int(u - reach), 0) // pitch * pitch, min(int(u + reach) + 2, image.shape[1] - pitch + 1), step):
+                if np.hypot(x - u, y - v) > 1.5 * outer and dark < rim.shape[1]:
+                    _read(image, planes, scale, y, x, value)
+                    for p in range(planes):
+                        rim[order[p], dark] = _light(value[p], linear)
+                    dark += 1
+        for c in range(3):
+            if count[c] == 0.0 or dark == 0:
+                signal[n, c] = sigma[n, c] = np.nan
+                continue
+            level, spread = _clipped_moments(rim[c, :dark])
+            signal[n, c] = total[c] / count[c] - level
+            sigma[n, c] = spread / np.sqrt(count[c]) + 1e-3
+
+
+@njit(cache=True)
+def _read(image: Image, planes: int, scale: float, y: int, x: int, value: Array) -> float:
+    """Samples of all planes at a pixel, or in a cell of a mosaic; returns the largest."""
+    largest = 0.0
+    for p in range(planes):
+        value[p] = scale * (image[y, x, p] if planes == 3 else image[y + (p >> 1), x + (p & 1), 0])
+        largest = max(largest, value[p])
+    return largest
+
+
+@njit(cache=True)
+def _light(value: float, linear: Array) -> float:
+    return float(linear[min(int(value + 0.5), 255)]) if len(linear) else value
+
+
+@njit(cache=True)
+def _is_burnt(image: Image, planes: int, scale: float, clipped: float, u: float, v: float, reach: float) -> bool:
+    step = 1 + int(reach) // 8
+    for y in range(max(int(v - reach), 0), min(int(v + reach) + 2, image.shape[0]), step):
+        for x in range(max(int(u - reach), 0), min(int(u + reach) + 2, image.shape[1]), step):
+            if np.hypot(x - u, y - v) <= reach:
+                for p in range(image.shape[2]):
+                    if scale * image[y, x, p] >= clipped:
+                        return True
+    return False
+
+
+@njit(cache=True)
+def _clipped_moments(values: Array) -> tuple[float, float]:
+    """Mean and standard deviation without outliers."""
+    level, spread = values.mean(), values.std()
+    for _ in range(_CLIP_ROUNDS):
+        total, squares, count = 0.0, 0.0, 0
+        for x in values:
+            if abs(x - level) <= _CLIP * spread:
+                total += x - level
+                squares += (x - level) ** 2
+                count += 1
+        if count == 0:
+            break
+        shift = total / count
+        level, spread = level + shift, np.sqrt(max(squares / count - shift * shift, 0.0))
+    return level, spread
