@@ -43,11 +43,10 @@ class Scan:
         self.line = np.empty((2, (width + 2 * tiles.TILE_PX) * self.channels), dtype)
         self.raw_level, self.level = np.zeros((maps, hb, wb), dtype), np.zeros((maps, hb, wb), np.float32)
         self.raw_sigma, self.sigma = np.zeros((hb, wb), np.float32), np.zeros((hb, wb), np.float32)
-        self.raw_plane = np.zeros((maps, hb, -(-wb // tiles.SPARSE)), np.float32)
+        self.by_plane = np.zeros((2, maps, hb, -(-wb // tiles.SPARSE)), np.float32)
         self.spread = np.ones(maps)
-        self.raw_shared = np.zeros((maps, hb, -(-wb // tiles.SPARSE)), np.float32)
         self.seen = np.zeros((h, w), np.uint8)
-        self.found = np.empty((h * w, 4))
+        self.found = np.empty((h * w, 5))
         self.spots = np.empty((config.max_spots, kernels.COLUMNS))
         self.whole = np.array([[0, h, 0, w]])
         self.shared = np.ones(4)
@@ -81,27 +80,18 @@ def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None) -> Dete
     scan = scan or Scan(frame, config)
     image = np.ascontiguousarray(frame.image)
     rows = image.reshape(len(image), -1)
-    _look(rows, scan, scan.whole[0])
+    _look(rows, scan, (0, len(scan.sigma)))
     return _search(frame, rows, scan, scan.whole, config)
 
 
-def _look(rows: Array, scan: Scan, rect: Indices) -> None:
-    """Bring the tiles of whole rows of blocks up to date, and what goes with them."""
-    blocks = int(rect[0]) // tiles.BLOCK, -(-int(rect[1]) // tiles.BLOCK)
-    tiles.refresh(rows, scan.planes, rect, scan.peak, scan.line)
-    tiles.noise(rows, scan.channels, blocks, scan.raw_sigma, scan.raw_plane, scan.raw_shared)
-    for peak, raw, level in zip(scan.peak, scan.raw_level, scan.level, strict=True):
-        tiles.levels(peak, blocks, raw)
-        tiles.smoothed(raw, level)
-    tiles.smoothed(scan.raw_sigma, scan.sigma)
-    np.maximum(scan.sigma, scan.least_noise / scan.scale, out=scan.sigma)
-    if scan.planes == 4:
-        return
-    here = np.median(scan.raw_plane.reshape(len(scan.peak), -1), axis=1)
-    typical = max(float(np.median(scan.raw_sigma)), 0.5)
-    scan.spread[:] = np.clip(here / typical, 0.7, 2.0)
-    of_sums = np.median(scan.raw_shared.reshape(len(scan.peak), -1), axis=1)
-    scan.shared[: len(here)] = np.clip((of_sums / np.maximum(here, 0.5)) ** 2, 1.0, _MOST_SHARED)
+def _look(rows: Array, scan: Scan, blocks: tuple[int, int]) -> None:
+    """Bring some rows of blocks up to date, and what goes with them."""
+    tiles.survey(rows, scan.planes, blocks, scan.peak, scan.line, scan.raw_level, scan.raw_sigma, scan.by_plane)
+    most = 1.0 if scan.planes == 4 else _MOST_SHARED
+    least = scan.least_noise / scan.scale
+    tiles.settle(
+        scan.raw_level, scan.raw_sigma, scan.by_plane, least, most, scan.level, scan.sigma, scan.spread, scan.shared
+    )
 
 
 def _search(frame: Frame, rows: Array, scan: Scan, rects: Indices, config: DetectConfig) -> Detections:

@@ -45,15 +45,23 @@ def colors(
         low, high = (radius[n] + clear_px, outer) if burnt else (0.0, inner)
         fine = max(step // 2 // pitch * pitch, pitch) if high < 8.0 else step
         total, count, dark = np.zeros(3), np.zeros(3), 0
-        for y in range(max(int(v - high), 0) // pitch * pitch, min(int(v + high) + 2, image.shape[0] - pitch + 1), fine):
-            for x in range(max(int(u - high), 0) // pitch * pitch, min(int(u + high) + 2, image.shape[1] - pitch + 1), fine):
+        for y in range(
+            max(int(v - high), 0) // pitch * pitch, min(int(v + high) + 2, image.shape[0] - pitch + 1), fine
+        ):
+            for x in range(
+                max(int(u - high), 0) // pitch * pitch, min(int(u + high) + 2, image.shape[1] - pitch + 1), fine
+            ):
                 distance = np.hypot(x + 0.5 * (pitch - 1) - u, y + 0.5 * (pitch - 1) - v)
                 if low <= distance <= high and _read(image, planes, scale, y, x, value) < clipped:
                     for p in range(planes):
                         total[order[p]] += _light(value[p], linear)
                         count[order[p]] += 1.0
-        for y in range(max(int(v - reach), 0) // pitch * pitch, min(int(v + reach) + 2, image.shape[0] - pitch + 1), step):
-            for x in range(max(int(u - reach), 0) // pitch * pitch, min(int(u + reach) + 2, image.shape[1] - pitch + 1), step):
+        for y in range(
+            max(int(v - reach), 0) // pitch * pitch, min(int(v + reach) + 2, image.shape[0] - pitch + 1), step
+        ):
+            for x in range(
+                max(int(u - reach), 0) // pitch * pitch, min(int(u + reach) + 2, image.shape[1] - pitch + 1), step
+            ):
                 if np.hypot(x - u, y - v) > 1.5 * outer and dark < rim.shape[1]:
                     _read(image, planes, scale, y, x, value)
                     for p in range(planes):

@@ -12,7 +12,9 @@ from lumidock._kernels import patch, tiles
 from lumidock._kernels.patch import Window
 from lumidock.datatypes import Array, Image, Indices
 
-U, V, RADIUS, FLUX, SNR, ELONGATION, FILL, LEVEL, SATURATED, CUT, HALO, CORE, P_LIGHT, VAR_UU, VAR_UV, VAR_VV = range(16)
+U, V, RADIUS, FLUX, SNR, ELONGATION, FILL, LEVEL, SATURATED, CUT, HALO, CORE, P_LIGHT, VAR_UU, VAR_UV, VAR_VV = range(
+    16
+)
 COLUMNS = 16
 # what may be tuned, see `DetectConfig`
 (
@@ -45,6 +47,7 @@ _MAX_TILES = 20  # a light is not wider
 _FILTER_PX = 1.2  # width of the window that judges a small spot ...
 _FILTERED_PX = 3.0  # ... up to this radius
 _ROUNDS = 4
+_QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth having clears 1.8
 _LEAST_STEP = 30.0  # levels by which a saturated light stands out in the plane that shows it best
 
 
@@ -76,8 +79,10 @@ def search(
     contrast = q[CONTRAST] * np.sqrt(shared_by_plane.max())
     for p in range(len(peak)):
         for k in range(len(rects)):
-            more = tiles.candidates(peak[p], level[p], sigma, spread[p], contrast, clipped, rects[k], seen, found[count:])
-            found[count : count + more, 3] = p
+            more = tiles.candidates(
+                peak[p], level[p], sigma, spread[p], contrast, clipped, rects[k], seen, found[count:]
+            )
+            found[count : count + more, 4] = p
             count += more
     count = _most_outstanding(found, count, most[0])
     order = _brightest_first(image, planes, found, count)
@@ -94,11 +99,13 @@ def search(
         if n == len(spots) or work <= 0:
             break
         i, j = int(found[k, 0]), int(found[k, 1])
-        if seen[i, j]:
+        if seen[i, j] or seen[int(found[k, 2]) // tiles.TILE_PX, int(found[k, 3]) // tiles.TILE_PX]:
             continue
         noise = max(scale * sigma[i // tiles.BLOCK, j // tiles.BLOCK], q[MIN_NOISE])
-        v, u = int(found[k, 2]), int(found[k, 3])
-        status = _measure(image, planes, scale, peak, i, j, v, u, level, noise, shared_by_plane, q, window, seen, spots, n)
+        v, u, p = int(found[k, 2]), int(found[k, 3]), int(found[k, 4])
+        status = _measure(
+            image, planes, scale, peak, i, j, v, u, p, level, noise, shared_by_plane, q, window, seen, spots, n
+        )
         work -= status >= 0
         n += status > 0
     for k in range(n):
@@ -131,7 +138,7 @@ def _brightest_first(image: Image, planes: int, found: Array, count: int) -> Ind
     key = np.empty(count)
     peaks = 0
     for k in range(count):
-        i, j, p = int(found[k, 0]), int(found[k, 1]), int(found[k, 3])
+        i, j, p = int(found[k, 0]), int(found[k, 1]), int(found[k, 4])
         found[k, 2], found[k, 3], rank = _brightest(image, planes, p, i, j)
         key[k] = -rank
         peaks += rank > 0
@@ -190,14 +197,17 @@ def _rank(image: Image, planes: int, p: int, v: int, u: int) -> int:
 def _extent(peak: Image, i: int, j: int, level: Array) -> float:
     """Radius px that the tiles give a spot at half height: of its narrower side, half a tile at least.
 
-    In the plane in which it stands out most.
+    In the plane in which it stands out most, over the background or what is left of it on the halo of something larger.
     """
     p, most = 0, -1e9
     for k in range(len(peak)):
         over = float(peak[k, i, j]) - level[k, i // tiles.BLOCK, j // tiles.BLOCK]
         if over > most:
             p, most = k, over
-    half = float(peak[p, i, j]) - 0.5 * most
+    step = 0
+    for far in (4, 8, 16):
+        step = max(step, tiles.over_pairs(peak[p], i, j, far))
+    half = float(peak[p, i, j]) - 0.5 * min(most, 0.5 * step)
     width, height = 1, 1
     for step in (-1, 1):
         k = 1
@@ -221,6 +231,7 @@ def _measure(
     j: int,
     v: int,
     u: int,
+    p: int,
     level: Array,
     noise: float,
     shared_by_plane: Array,
@@ -239,13 +250,18 @@ def _measure(
             return -1
     else:
         radius = min(_extent(peak, i, j, level), q[MAX_RADIUS_PX])
+        sigma = noise * np.sqrt(shared_by_plane[p])
+        if radius <= tiles.TILE_PX and not patch.stands_out(
+            image, planes, scale, p + (p == 2 and planes == 4), v, u, q[RING_PX], sigma, _QUICK
+        ):
+            return -1
         patch.weigh(image, planes, scale, v, u, radius, weight)
     shared = (weight**2 * shared_by_plane).sum() / (weight**2).sum()
     expected = noise * np.sqrt((weight**2).sum())
     reach = min(max(3.5 * radius, 1.5 * q[RING_PX]), 3.5 * q[MAX_RADIUS_PX])
     part, ground = 0.0, np.zeros(3)  # level, noise and texture of the surroundings
     for turn in range(_ROUNDS):
-        patch.cut(image, planes, scale, weight, v, u, reach, window[0], where)
+        patch.cut(image, planes, scale, weight, v, u, reach, patch.COARSE_SIDE, window[0], where)
         start[0], start[1] = _index(u, where[0], where[2], where[3]), _index(v, where[1], where[2], where[4])
         ring = 0.9 * reach / where[patch.UNIT]
         ground[0], spread = patch.flatten(window[0], where, float(start[0]), float(start[1]), ring)
@@ -260,6 +276,9 @@ def _measure(
         part = _level(image, planes, window, where, start, ground[0], q, spots, n)
         sums = window[3]
         if part == 0.0:
+            if not clipped:
+                _own(seen, window[1], where, start)
+                return 0
             if sums[patch.OPEN] == 0.0 or reach >= 3.5 * q[MAX_RADIUS_PX]:
                 _own_plateau(image, planes, scale, weight, v, u, reach, q, window, where, start, seen)
                 return 0
@@ -307,7 +326,15 @@ def _peak_value(part: Array, where: Array, start: Indices) -> float:
 
 @njit(cache=True)
 def _level(
-    image: Image, planes: int, window: Window, where: Array, start: Indices, floor: float, q: Array, spots: Array, n: int
+    image: Image,
+    planes: int,
+    window: Window,
+    where: Array,
+    start: Indices,
+    floor: float,
+    q: Array,
+    spots: Array,
+    n: int,
 ) -> float:
     """Grow the spot at the lowest share of its peak where it is round and alone, at the lowest where it is alone otherwise.
 
@@ -325,9 +352,7 @@ def _level(
         if again and fallback == 0.0:
             return 0.0
         share = fallback if again else _LEVELS[k]
-        patch.grow(
-            window, where, image, start[0], start[1], floor + share * (top - floor), q[CLIPPED], k + 1
-        )
+        patch.grow(window, where, image, start[0], start[1], floor + share * (top - floor), q[CLIPPED], k + 1)
         sums = window[3]
         if _holds_another(window[1], where, k + 1, spots, n):
             sums[patch.OPEN] = 0.0  # a wider window does not help
@@ -394,7 +419,7 @@ def _describe(
     spread = _unresolved(sums, q, unit)
     skew_u, skew_v = _skew(image, window, where, start, level + 0.5 * (top - level), q, unit)
     if unit > pitch:  # again, as finely as the room allows
-        patch.cut(image, planes, scale, weight, v, u, 1.6 * radius + 3.0, window[0], where)
+        patch.cut(image, planes, scale, weight, v, u, 1.6 * radius + 3.0, patch.SIDE, window[0], where)
         unit = where[patch.UNIT]
         start[0], start[1] = _index(u, where[0], where[2], where[3]), _index(v, where[1], where[2], where[4])
         _peak_value(window[0], where, start)
@@ -412,7 +437,16 @@ def _describe(
     if radius <= q[SMALL_PX] and sums[patch.EDGE] == 0.0:
         sample_noise = noise if planes < 4 else max(noise / np.sqrt((weight**2).sum()), q[MIN_NOISE])
         width = patch.fit(
-            image, planes, scale, weight, center, max(radius / 1.18, 0.8), sample_noise, q[SIGNAL_NOISE], q[CLIPPED], cov
+            image,
+            planes,
+            scale,
+            weight,
+            center,
+            max(radius / 1.18, 0.8),
+            sample_noise,
+            q[SIGNAL_NOISE],
+            q[CLIPPED],
+            cov,
         )
         if width > 0.0:
             fitted = True
@@ -493,12 +527,17 @@ def _is_known(spots: Array, n: int) -> bool:
 @njit(cache=True)
 def _own(seen: Image, stamp: Array, where: Array, start: Indices) -> None:
     """Mark the tiles that the grown region touches: nobody looks there again."""
-    mark = stamp[start[1], start[0]]
+    mark, t = stamp[start[1], start[0]], tiles.TILE_PX
+    unit = int(where[patch.UNIT])
     for y in range(int(where[patch.ROWS])):
-        i = int(where[patch.TOP] + y * where[patch.UNIT]) // tiles.TILE_PX
+        top = int(where[patch.TOP]) + y * unit
         for x in range(int(where[patch.COLUMNS])):
             if stamp[y, x] == mark:
-                seen[i, int(where[patch.LEFT] + x * where[patch.UNIT]) // tiles.TILE_PX] = 1
+                left = int(where[patch.LEFT]) + x * unit
+                for i in range(top // t, (top + unit - 1) // t + 1):
+                    for j in range(left // t, (left + unit - 1) // t + 1):
+                        if i < seen.shape[0] and j < seen.shape[1]:
+                            seen[i, j] = 1
 
 
 @njit(cache=True)
@@ -524,7 +563,7 @@ def _own_plateau(
             darkest, least = p, mean
     weight[:] = 0.0
     weight[darkest] = 1.0
-    patch.cut(image, planes, scale, weight, v, u, reach, window[0], where)
+    patch.cut(image, planes, scale, weight, v, u, reach, patch.COARSE_SIDE, window[0], where)
     start[0], start[1] = _index(u, where[0], where[2], where[3]), _index(v, where[1], where[2], where[4])
     window[1][:] = 0
     patch.grow(window, where, image, start[0], start[1], _LEVELS[-1] * least, q[CLIPPED], 1)

@@ -2,7 +2,7 @@
 
 Samples come as (H, W, C) of an unsigned type, 1 or 3 channels, or one channel that is a Bayer mosaic. A window is one
 plane of floats in 8-bit grey levels: the planes (colours) weighted by how far the light stands out in each. Large windows
-are thinned out to about `SIDE` samples a side.
+are thinned out.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from lumidock.datatypes import Array, Image
 
-SIDE = 64
+COARSE_SIDE, SIDE = 32, 48  # samples a side of the window that finds a spot's level, and of the one that measures it
 _ROOM = SIDE + 16
 _RING = 24  # samples on a ring
 _COS, _SIN = np.cos(np.arange(_RING) * 2.0 * np.pi / _RING), np.sin(np.arange(_RING) * 2.0 * np.pi / _RING)
+_ROOT_TWO = np.sqrt(2.0)
 _FIT_ROUNDS, _FIT_REACH = 6, 9
 _PRIOR_DOF = 20.0  # how much the expected noise counts beside the residuals of a fit
 # entries of `sums`, see `grow`; weights w are over the level
@@ -112,6 +113,29 @@ def ring_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int, r
 
 
 @njit(cache=True)
+def stands_out(
+    image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float, noise: float, least: float
+) -> bool:
+    """Whether 3 x 3 samples clear a ring by `least` times its scatter or the noise: cheap enough for every candidate.
+
+    Of opposite samples, whose mean no slope moves.
+    """
+    means, count = np.empty(_RING // 4), 0
+    for k in range(0, _RING // 2, 2):
+        x, y = int(np.floor(radius * _COS[k] + 0.5)), int(np.floor(radius * _SIN[k] + 0.5))
+        if min(u - abs(x), v - abs(y)) < 0 or u + abs(x) >= image.shape[1] or v + abs(y) >= image.shape[0]:
+            continue
+        both = sample(image, planes, p, v + y, u + x) + sample(image, planes, p, v - y, u - x)
+        count = _insert(means, count, 0.5 * scale * both)
+    if count < len(means):
+        return True
+    level = means[1:5].mean()
+    spread = _ROOT_TWO * (means[4] - means[1]) / 1.35
+    over = core_mean(image, planes, scale, p, v, u) - level
+    return over >= least * max(noise, spread)
+
+
+@njit(cache=True)
 def _insert(ordered: Array, count: int, value: float) -> int:
     """Insert into the first `count` of the sorted values; returns the new count."""
     k = count
@@ -124,11 +148,23 @@ def _insert(ordered: Array, count: int, value: float) -> int:
 
 @njit(cache=True)
 def cut(
-    image: Image, planes: int, scale: float, weight: Array, v: int, u: int, reach: float, patch: Array, where: Array
+    image: Image,
+    planes: int,
+    scale: float,
+    weight: Array,
+    v: int,
+    u: int,
+    reach: float,
+    side: int,
+    patch: Array,
+    where: Array,
 ) -> None:
-    """Fill `patch` with the window of `reach` px around a pixel; `where` becomes its left, top, unit, columns, rows."""
+    """Fill `patch` with the window of `reach` px around a pixel, thinned out to about `side` samples a side.
+
+    `where` becomes its left, top, unit, columns, rows.
+    """
     pitch = 2 if planes == 4 else 1
-    unit = pitch * max(int(np.ceil(2.0 * reach / (pitch * SIDE))), 1)
+    unit = pitch * max(int(np.ceil(2.0 * reach / (pitch * side))), 1)
     left, top = max(u - int(reach), 0) // pitch * pitch, max(v - int(reach), 0) // pitch * pitch
     columns = min((min(u + int(reach) + 1, image.shape[1]) - left) // unit, _ROOM)
     rows = min((min(v + int(reach) + 1, image.shape[0]) - top) // unit, _ROOM)
@@ -536,9 +572,15 @@ def _solve(S: Array, b: Array) -> tuple[Array, bool]:
     x = np.zeros(3)
     if not det > 1e-12 * S[0, 0] * S[1, 1] * S[2, 2]:
         return x, False
-    x[0] = (c0 * b[0] + (S[0, 2] * S[2, 1] - S[0, 1] * S[2, 2]) * b[1] + (S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]) * b[2]) / det
-    x[1] = (c1 * b[0] + (S[0, 0] * S[2, 2] - S[0, 2] * S[2, 0]) * b[1] + (S[0, 2] * S[1, 0] - S[0, 0] * S[1, 2]) * b[2]) / det
-    x[2] = (c2 * b[0] + (S[0, 1] * S[2, 0] - S[0, 0] * S[2, 1]) * b[1] + (S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]) * b[2]) / det
+    x[0] = (
+        c0 * b[0] + (S[0, 2] * S[2, 1] - S[0, 1] * S[2, 2]) * b[1] + (S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]) * b[2]
+    ) / det
+    x[1] = (
+        c1 * b[0] + (S[0, 0] * S[2, 2] - S[0, 2] * S[2, 0]) * b[1] + (S[0, 2] * S[1, 0] - S[0, 0] * S[1, 2]) * b[2]
+    ) / det
+    x[2] = (
+        c2 * b[0] + (S[0, 1] * S[2, 0] - S[0, 0] * S[2, 1]) * b[1] + (S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]) * b[2]
+    ) / det
     return x, True
 
 

@@ -129,26 +129,72 @@ def _largest_of_wide_tiles(line: Image, scratch: Image, out: Image) -> None:
 
 
 @njit(cache=True)
-def noise(rows: Image, channels: int, blocks: tuple[int, int], sigma: Array, plane: Array, shared: Array) -> None:
-    """Write the noise of the rows of blocks from `blocks[0]` to `blocks[1]`: 1 sigma of a sample, `sigma` (h, w).
+def survey(
+    rows: Image,
+    planes: int,
+    blocks: tuple[int, int],
+    peak: Image,
+    line: Image,
+    level: Image,
+    sigma: Array,
+    by_plane: Array,
+) -> None:
+    """Bring the rows of blocks from `blocks[0]` to `blocks[1]` up to date: `peak` of their tiles (P, h, w), and of blocks
+    `level` (P, h, w), the median of their tiles, `sigma` (h, w), the noise of a sample, and `by_plane` (2, P, h, w / 4).
 
-    `plane` (P, h, w / 4) is that of each channel and `shared` (P, h, w / 4) what the sums of eight neighbours make of it,
-    over the root of eight; demosaicing and JPEG share noise. One row of pixels speaks for a row of
-    blocks, by second differences, which no slope reaches, of every other pixel, which a mosaic does not.
+    That is the noise of each plane, and what the sums of eight neighbours make of it over the root of eight: demosaicing and
+    JPEG share noise. One row of pixels speaks for a row of blocks, by second differences, which no slope reaches, of every
+    other pixel, which a mosaic does not.
     """
-    samples = rows.shape[1]
+    channels = 3 if planes == 3 else 1
+    rect = np.array([0, 0, 0, peak.shape[2]])
     for b in range(blocks[0], blocks[1]):
-        row = rows[min(b * BLOCK * TILE_PX + 3 * TILE_PX, len(rows) - 1)]
-        for k in range(sigma.shape[1]):
-            low, n = k * BLOCK * TILE_PX * channels, BLOCK * TILE_PX * channels
-            low = max(min(low, samples - n), 0)
-            part = row[low : min(low + n, samples)]
-            sigma[b, k] = _SIGMA * _second_difference(part, 2 * channels)
-            if k % SPARSE == 0:
-                for p in range(len(plane)):
-                    own = part[p % channels :: channels]
-                    plane[p, b, k // SPARSE] = _SIGMA * _second_difference(own, 2)
-                    shared[p, b, k // SPARSE] = _SIGMA * _second_difference_of_sums(own)
+        rect[0], rect[1] = b * BLOCK, min((b + 1) * BLOCK, peak.shape[1])
+        refresh(rows, planes, rect, peak, line)
+        for p in range(len(peak)):
+            _levels(peak[p], b, level[p])
+        _noise(rows[min(b * BLOCK * TILE_PX + 3 * TILE_PX, len(rows) - 1)], channels, sigma[b], by_plane[:, :, b])
+
+
+@njit(cache=True)
+def _noise(row: Image, channels: int, sigma: Array, by_plane: Array) -> None:
+    for k in range(len(sigma)):
+        low, n = k * BLOCK * TILE_PX * channels, BLOCK * TILE_PX * channels
+        low = max(min(low, len(row) - n), 0)
+        part = row[low : min(low + n, len(row))]
+        sigma[k] = _SIGMA * _second_difference(part, 2 * channels)
+        if k % SPARSE == 0:
+            for p in range(by_plane.shape[1]):
+                own = part[p % channels :: channels]
+                by_plane[0, p, k // SPARSE] = _SIGMA * _second_difference(own, 2)
+                by_plane[1, p, k // SPARSE] = _SIGMA * _second_difference_of_sums(own)
+
+
+@njit(cache=True)
+def settle(
+    raw_level: Image,
+    raw_sigma: Array,
+    by_plane: Array,
+    least: float,
+    most: float,
+    level: Array,
+    sigma: Array,
+    spread: Array,
+    shared: Array,
+) -> None:
+    """What a frame's blocks say together: smooth `level` and `sigma`, and of each plane the `spread`, its noise over sigma,
+    and how many times over, `shared` (4,), noise averages out less than that of independent samples, up to `most`."""
+    for p in range(len(level)):
+        _smoothed(raw_level[p], level[p])
+    _smoothed(raw_sigma, sigma)
+    for i in range(sigma.shape[0]):
+        for j in range(sigma.shape[1]):
+            sigma[i, j] = max(sigma[i, j], least)
+    typical = np.median(sigma[::2, ::2].copy())
+    for p in range(len(level)):
+        own = np.median(by_plane[0, p].copy())
+        spread[p] = min(max(own / typical, 0.7), 2.0)
+        shared[p] = min(max((np.median(by_plane[1, p].copy()) / max(own, 0.7 * least)) ** 2, 1.0), most)
 
 
 @njit(cache=True)
@@ -182,23 +228,22 @@ def _second_difference_of_sums(row: Image) -> float:
 
 
 @njit(cache=True)
-def levels(peak: Image, blocks: tuple[int, int], level: Image) -> None:
-    """Write the median of the tiles of each block, row by row and then of those, of some rows of blocks, to `level`."""
+def _levels(peak: Image, b: int, level: Image) -> None:
+    """Write the median of the tiles of each block of one row of blocks, row by row and then of those, to `level[b]`."""
     h, w = peak.shape
     columns, rows = np.empty((8, w), peak.dtype), np.empty((8, level.shape[1]), peak.dtype)
-    for b in range(blocks[0], blocks[1]):
+    for k in range(8):
+        columns[k] = peak[min(b * BLOCK + k, h - 1)]
+    _sort_columns(columns)
+    for j in range(level.shape[1]):
         for k in range(8):
-            columns[k] = peak[min(b * BLOCK + k, h - 1)]
-        _sort_columns(columns)
-        for j in range(level.shape[1]):
-            for k in range(8):
-                rows[k, j] = columns[4, min(j * BLOCK + k, w - 1)]
-        _sort_columns(rows)
-        level[b] = rows[4]
+            rows[k, j] = columns[4, min(j * BLOCK + k, w - 1)]
+    _sort_columns(rows)
+    level[b] = rows[4]
 
 
 @njit(cache=True)
-def smoothed(values: Array, out: Array) -> None:
+def _smoothed(values: Array, out: Array) -> None:
     """Write the median of five columns of the medians of five rows around each of `values` (h, w) to `out`."""
     h, w = values.shape
     rows, columns = np.empty((8, w), np.float32), np.empty((8, w), np.float32)
@@ -266,7 +311,7 @@ def candidates(
             if peak[i, j] < least[j] or seen[i, j] or count == len(found):
                 continue
             here = spread * sigma[b, j // BLOCK]
-            if not _stands_out(peak, i, j, 1.5 * contrast * here, clipped):
+            if not _stands_out(peak, i, j, int(1.5 * contrast * here), int(clipped)):
                 continue
             seen[i, j] = 1
             found[count, 0], found[count, 1] = i, j
@@ -284,20 +329,30 @@ def _any_reaches(values: Image, least: Image) -> bool:
 
 
 @njit(cache=True)
-def _stands_out(peak: Image, i: int, j: int, margin: float, clipped: float) -> bool:
-    near = _over_pairs(peak, i, j, 1)
-    if near < 0.0:
+def _stands_out(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
+    """Whether a tile is neither on a slope nor on a halo, see `candidates`: along the row first, which settles most."""
+    w = peak.shape[1]
+    twice = 2 * int(peak[i, j])
+    near = twice - int(peak[i, max(j - 1, 0)]) - int(peak[i, min(j + 1, w - 1)])
+    if near < 0:
         return False
-    return bool(peak[i, j] >= clipped or near >= margin or _over_pairs(peak, i, j, _FAR) >= margin)
+    if twice < 2 * clipped and near < margin:
+        far = twice - int(peak[i, max(j - _FAR, 0)]) - int(peak[i, min(j + _FAR, w - 1)])
+        if far < margin:
+            return False
+    near = over_pairs(peak, i, j, 1)
+    if near < 0:
+        return False
+    return twice >= 2 * clipped or near >= margin or over_pairs(peak, i, j, _FAR) >= margin
 
 
 @njit(cache=True)
-def _over_pairs(peak: Image, i: int, j: int, d: int) -> float:
+def over_pairs(peak: Image, i: int, j: int, d: int) -> int:
     """Twice the value of a tile less that of two on opposite sides, `d` tiles away, the least of four ways."""
     h, w = peak.shape
     top, bottom, left, right = max(i - d, 0), min(i + d, h - 1), max(j - d, 0), min(j + d, w - 1)
     most = max(
-        max(float(peak[top, j]) + float(peak[bottom, j]), float(peak[i, left]) + float(peak[i, right])),
-        max(float(peak[top, left]) + float(peak[bottom, right]), float(peak[top, right]) + float(peak[bottom, left])),
+        max(int(peak[top, j]) + int(peak[bottom, j]), int(peak[i, left]) + int(peak[i, right])),
+        max(int(peak[top, left]) + int(peak[bottom, right]), int(peak[top, right]) + int(peak[bottom, left])),
     )
-    return 2.0 * float(peak[i, j]) - most
+    return 2 * int(peak[i, j]) - most
