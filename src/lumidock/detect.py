@@ -22,6 +22,7 @@ _PLANES = {"mono": 1, "bgr": 3, "bayer": 4}
 _SATURATED = 250.0  # of 255
 _SIXTEEN = 255.0 / 65535.0  # 8-bit levels of a 16-bit step
 _TWELVE_BITS = 16.0  # steps of a sensor of 12 bits in 16
+_LEAST_SIDE = 4  # pixels; in less nothing stands out
 _MOST_SHARED = 6.0  # more is a texture
 
 
@@ -75,7 +76,7 @@ def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None) -> Dete
 
     The layer is not known yet. Takes any picture; one without lights gives no detections.
     """
-    if not frame.image.size:
+    if min(frame.image.shape[:2]) < _LEAST_SIDE:
         return _detections(frame, np.empty((0, kernels.COLUMNS)))
     scan = scan or Scan(frame, config)
     image = np.ascontiguousarray(frame.image)

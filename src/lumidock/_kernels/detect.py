@@ -251,7 +251,7 @@ def _measure(
     else:
         radius = min(_extent(peak, i, j, level), q[MAX_RADIUS_PX])
         sigma = noise * np.sqrt(shared_by_plane[p])
-        if radius <= tiles.TILE_PX and not patch.stands_out(
+        if radius < tiles.TILE_PX and not patch.stands_out(
             image, planes, scale, p + (p == 2 and planes == 4), v, u, q[RING_PX], sigma, _QUICK
         ):
             return -1
