@@ -22,6 +22,9 @@ _PLANES = {"mono": 1, "bgr": 3, "bayer": 4}
 _SATURATED = 250.0  # of 255
 _SIXTEEN = 255.0 / 65535.0  # 8-bit levels of a 16-bit step
 _TWELVE_BITS = 16.0  # steps of a sensor of 12 bits in 16
+SWEEP = 8  # frames in which a tracked search has seen everything
+_DRIFT_PX = 20.0  # around a spot, in which it is looked for in the next frame
+_MOST_WINDOWS = 0.25  # of the frame; for more a full search is cheaper
 _LEAST_SIDE = 4  # pixels; in less nothing stands out
 _MOST_SHARED = 6.0  # more is a texture
 
@@ -53,6 +56,38 @@ class Scan:
         self.shared = np.ones(4)
         self.least_noise = config.min_noise * (1.0 if dtype == np.uint8 else _TWELVE_BITS * _SIXTEEN)
         self.q = _parameters(config, max(height, width), self.least_noise)
+        self.swept, self.part = False, 0
+        self.last = np.empty((0, 3))
+
+    def fits(self, frame: Frame) -> bool:
+        """Whether a frame is like those that this was made for."""
+        return self.like == (frame.image.shape, frame.image.dtype, frame.encoding)
+
+    def next_part(self) -> tuple[int, int]:
+        """The rows of blocks whose turn it is; after the last ones, what all of them say is brought up to date."""
+        rows = len(self.sigma)
+        first, last = self.part * rows // SWEEP, (self.part + 1) * rows // SWEEP
+        self.part = (self.part + 1) % SWEEP
+        if self.part == 0:
+            _settle(self)
+        return first, last
+
+    def windows(self, expected: Array) -> Indices:
+        """Tiles (n, 4) around the expected lights and the spots of the last frame, and of the part whose turn it is.
+
+        The whole frame where windows would be a good part of it.
+        """
+        seen = np.column_stack([self.last[:, :2], 2.0 * self.last[:, 2] + _DRIFT_PX])
+        u, v, reach = np.concatenate([expected, seen]).T / tiles.TILE_PX
+        h, w = self.peak.shape[1:]
+        rects = np.empty((len(u) + 1, 4), np.int64)
+        rects[:-1, 0], rects[:-1, 1] = np.clip(v - reach, 0, h), np.clip(v + reach + 1.0, 0, h)
+        rects[:-1, 2], rects[:-1, 3] = np.clip(u - reach, 0, w), np.clip(u + reach + 1.0, 0, w)
+        rows = len(self.sigma)
+        first, last = self.part * rows // SWEEP, (self.part + 1) * rows // SWEEP
+        rects[-1] = first * tiles.BLOCK, min(last * tiles.BLOCK, h), 0, w
+        area = ((rects[:-1, 1] - rects[:-1, 0]) * (rects[:-1, 3] - rects[:-1, 2])).sum()
+        return rects if area < _MOST_WINDOWS * h * w else self.whole
 
 
 def _parameters(config: DetectConfig, longer_side: int, least_noise: float) -> Array:
@@ -71,23 +106,35 @@ def _parameters(config: DetectConfig, longer_side: int, least_noise: float) -> A
     return q
 
 
-def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None) -> Detections:
-    """Find the lights of a frame in all of it.
+def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None, expected: Array | None = None) -> Detections:
+    """Find the lights of a frame: in all of it, or where they are expected and were seen, and in the next part of the rest.
 
-    The layer is not known yet. Takes any picture; one without lights gives no detections.
+    `expected` (n, 3) u, v and reach px of the lights foretold, for a `scan` that has seen the frame before; the rest comes
+    round in `SWEEP` frames. The layer is not known yet. Takes any picture; one without lights gives no detections.
     """
     if min(frame.image.shape[:2]) < _LEAST_SIDE:
         return _detections(frame, np.empty((0, kernels.COLUMNS)))
-    scan = scan or Scan(frame, config)
-    image = np.ascontiguousarray(frame.image)
-    rows = image.reshape(len(image), -1)
-    _look(rows, scan, (0, len(scan.sigma)))
-    return _search(frame, rows, scan, scan.whole, config)
+    scan = scan if scan is not None and scan.fits(frame) else Scan(frame, config)
+    rows = np.ascontiguousarray(frame.image).reshape(len(frame.image), -1)
+    rects = scan.windows(expected) if expected is not None and scan.swept else scan.whole
+    if rects is scan.whole:
+        _look(rows, scan, (0, len(scan.sigma)))
+        _settle(scan)
+        scan.swept, scan.part = True, 0
+    else:
+        first, last = scan.next_part()
+        _look(rows, scan, (first, last))
+        tiles.revisit(rows, scan.planes, rects[:-1], scan.peak, scan.line)
+    return _search(frame, rows, scan, rects, config)
 
 
 def _look(rows: Array, scan: Scan, blocks: tuple[int, int]) -> None:
-    """Bring some rows of blocks up to date, and what goes with them."""
+    """Bring some rows of blocks up to date."""
     tiles.survey(rows, scan.planes, blocks, scan.peak, scan.line, scan.raw_level, scan.raw_sigma, scan.by_plane)
+
+
+def _settle(scan: Scan) -> None:
+    """What all blocks say together."""
     most = 1.0 if scan.planes == 4 else _MOST_SHARED
     least = scan.least_noise / scan.scale
     tiles.settle(
@@ -113,6 +160,7 @@ def _search(frame: Frame, rows: Array, scan: Scan, rects: Indices, config: Detec
         scan.found,
         scan.spots,
     )
+    scan.last = scan.spots[:n, [kernels.U, kernels.V, kernels.RADIUS]]
     return _detections(frame, scan.spots[:n])
 
 

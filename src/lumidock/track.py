@@ -24,6 +24,7 @@ _NEVER = -(2**62)
 _FLATTENINGS = 12  # the flatter the view, the wider the tilt it leaves; then it stands
 NO_PLANE = np.full(6, np.nan)
 LAYER_LIGHTS, _PROOF_LIGHTS = 3, 4
+_MARGIN_PX, _MAX_REACH_PX = 16.0, 200.0  # of the window around a light that is foreseen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,6 +163,17 @@ def attend(track: Track, attitude: Attitude) -> Track:
     var = np.full(3, attitude.sigma_rad**2)
     kernel.attitude_update(R, t, x, P, np.ascontiguousarray(attitude.R_dock_cam), var, True)
     return replace(track, R=R, t=t, x=x, P=P)
+
+
+def foresee(track: Track, plan: Plan) -> Array:
+    """Where the lights of a predicted track will be seen: (n, 3) u, v and reach, four sigmas and a margin, px."""
+    m = len(plan.p_dock)
+    expected, S, shown = np.empty((m, 2)), np.empty((2 * m, 2 * m)), np.empty(m)
+    kernel.look(plan.lens, track.R, track.t, track.x, track.P, plan.p_dock, plan.axis, expected, S, shown)
+    variance = np.diagonal(S)
+    reach = 4.0 * np.sqrt(np.maximum(variance[::2], variance[1::2])) + _MARGIN_PX
+    seen = (shown > 0.0) & np.isfinite(expected).all(axis=1) & np.isfinite(reach)
+    return np.column_stack([expected, np.minimum(reach, _MAX_REACH_PX)])[seen]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

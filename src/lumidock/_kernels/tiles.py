@@ -157,6 +157,13 @@ def survey(
 
 
 @njit(cache=True)
+def revisit(rows: Image, planes: int, rects: Indices, peak: Image, line: Image) -> None:
+    """Bring the tiles of some windows `rects` (n, 4) up to date."""
+    for k in range(len(rects)):
+        refresh(rows, planes, rects[k], peak, line)
+
+
+@njit(cache=True)
 def _noise(row: Image, channels: int, sigma: Array, by_plane: Array) -> None:
     for k in range(len(sigma)):
         low, n = k * BLOCK * TILE_PX * channels, BLOCK * TILE_PX * channels
