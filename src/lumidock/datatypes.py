@@ -16,6 +16,7 @@ Indices = NDArray[np.int64]
 Status = Literal["none", "acquired", "tracking", "coasting"]
 Stage = Literal["search", "front", "transition", "rear"]
 MOSAICS = ("bayer_rggb", "bayer_bggr", "bayer_grbg", "bayer_gbrg")
+ENCODINGS = tuple(f"{kind}{bits}" for kind in ("mono", "bgr", *MOSAICS) for bits in (8, 16))
 MatchSource = Literal["pso", "btekf"]
 
 

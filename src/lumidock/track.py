@@ -171,7 +171,7 @@ def foresee(track: Track, plan: Plan) -> Array:
     expected, S, shown = np.empty((m, 2)), np.empty((2 * m, 2 * m)), np.empty(m)
     kernel.look(plan.lens, track.R, track.t, track.x, track.P, plan.p_dock, plan.axis, expected, S, shown)
     variance = np.diagonal(S)
-    reach = 4.0 * np.sqrt(np.maximum(variance[::2], variance[1::2])) + _MARGIN_PX
+    reach = 4.0 * np.sqrt(np.maximum(np.maximum(variance[::2], variance[1::2]), 0.0)) + _MARGIN_PX
     seen = (shown > 0.0) & np.isfinite(expected).all(axis=1) & np.isfinite(reach)
     return np.column_stack([expected, np.minimum(reach, _MAX_REACH_PX)])[seen]
 

@@ -429,7 +429,7 @@ def _describe(
     variance = noise**2 + q[SIGNAL_NOISE] * max(sums[patch.W] / area, 0.0)
     patch.balance(sums, variance * shared, center, cov)
     cov *= unit * unit
-    shift_u, shift_v = _plane_shift(weight, planes)
+    shift_u, shift_v = _plane_shift(weight, planes, spot[SATURATED] > 0.0)
     middle = 0.5 * (unit / pitch - 1.0) * 0.0
     center[0] = where[patch.LEFT] + unit * (start[0] + center[0]) + shift_u + middle
     center[1] = where[patch.TOP] + unit * (start[1] + center[1]) + shift_v + middle
@@ -480,13 +480,14 @@ def _around(part: Array, where: Array, start: Indices, sums: Array, radii: float
 
 
 @njit(cache=True)
-def _plane_shift(weight: Array, planes: int) -> tuple[float, float]:
+def _plane_shift(weight: Array, planes: int, clipped: bool) -> tuple[float, float]:
     """Where the samples of a cell lie on the average: planes of a mosaic stand a pixel apart."""
     if planes != 4:
         return 0.0, 0.0
-    # the weight of a plane goes with its share of the light, its part of the sum with the square
-    total = (weight**2).sum()
-    return float((weight[1] ** 2 + weight[3] ** 2) / total), float((weight[2] ** 2 + weight[3] ** 2) / total)
+    # the weight of a plane goes with its share of the light, its part of the sum with the square; clipped, all are alike
+    part = weight if clipped else weight**2
+    total = part.sum()
+    return float((part[1] + part[3]) / total), float((part[2] + part[3]) / total)
 
 
 @njit(cache=True)

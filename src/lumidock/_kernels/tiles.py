@@ -153,7 +153,8 @@ def survey(
         refresh(rows, planes, rect, peak, line)
         for p in range(len(peak)):
             _levels(peak[p], b, level[p])
-        _noise(rows[min(b * BLOCK * TILE_PX + 3 * TILE_PX, len(rows) - 1)], channels, sigma[b], by_plane[:, :, b])
+        v = min(b * BLOCK * TILE_PX + 3 * TILE_PX, (len(rows) - 2) & -2)
+        _noise(rows[v], rows[v + 1], planes, sigma[b], by_plane[:, :, b])
 
 
 @njit(cache=True)
@@ -164,15 +165,20 @@ def revisit(rows: Image, planes: int, rects: Indices, peak: Image, line: Image) 
 
 
 @njit(cache=True)
-def _noise(row: Image, channels: int, sigma: Array, by_plane: Array) -> None:
+def _noise(even: Image, odd: Image, planes: int, sigma: Array, by_plane: Array) -> None:
+    """The noise of one row of blocks, from an even and, of a mosaic, an odd row of pixels, see `survey`."""
+    channels = 3 if planes == 3 else 1
+    n = min(BLOCK * TILE_PX * channels, len(even))
     for k in range(len(sigma)):
-        low, n = k * BLOCK * TILE_PX * channels, BLOCK * TILE_PX * channels
-        low = max(min(low, len(row) - n), 0)
-        part = row[low : min(low + n, len(row))]
-        sigma[k] = _SIGMA * _second_difference(part, 2 * channels)
+        low = max(min(k * BLOCK * TILE_PX * channels, len(even) - n), 0)
+        sigma[k] = _SIGMA * _second_difference(even[low : low + n], 2 * channels)
         if k % SPARSE == 0:
             for p in range(by_plane.shape[1]):
-                own = part[p % channels :: channels]
+                if planes == 4:  # corners 0, 2 and 3 of the cell
+                    own = (odd if p else even)[(low & -2) + (p == 2) : low + n : 2]
+                    by_plane[0, p, k // SPARSE] = _SIGMA * _second_difference(own, 1)
+                    continue
+                own = even[low + p : low + n : channels]
                 by_plane[0, p, k // SPARSE] = _SIGMA * _second_difference(own, 2)
                 by_plane[1, p, k // SPARSE] = _SIGMA * _second_difference_of_sums(own)
 
@@ -200,7 +206,7 @@ def settle(
     typical = np.median(sigma[::2, ::2].copy())
     for p in range(len(level)):
         own = np.median(by_plane[0, p].copy())
-        spread[p] = min(max(own / typical, 0.7), 2.0)
+        spread[p] = min(max(own / typical, 0.3), 3.0)
         shared[p] = min(max((np.median(by_plane[1, p].copy()) / max(own, 0.7 * least)) ** 2, 1.0), most)
 
 

@@ -19,12 +19,13 @@ MAX_PIXELS = 100_000_000
 _PNG = b"\x89PNG\r\n\x1a\n"
 _SIZE_MARKERS, _SCAN = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}, 0xDA
 _END = b"\xff\xd9"
+_AS_IT_IS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 
-def read_image(path: Path) -> Image:
-    """Read a PNG or JPEG as (H, W) mono8 or, where it has colour, (H, W, 3) bgr8.
+def read_image(path: Path, encoding: str = "") -> Image:
+    """Read a PNG or JPEG as (H, W) mono or, where it has colour, (H, W, 3) BGR, of 8 or 16 bits as the file has them.
 
-    The header is read before any pixel, and the file must be complete: with zeros in place of its second half, as a
+    A file that `encoding` calls a mosaic has one channel. The header is read before any pixel, and the file must be complete: with zeros in place of its second half, as a
     power cut leaves it, the decoder takes it for whole. Raises: FrameError `bad_frame`, one line.
     """
     try:
@@ -45,12 +46,16 @@ def decode_image(data: bytes, path: object) -> Image:
     if not 0 < width * height <= MAX_PIXELS:
         raise _bad(path, f"{width}x{height} pixels")
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), _AS_IT_IS)
     except cv2.error:
         image = None
     if image is None:
         raise _bad(path, "cannot be decoded")
-    return mono_if_gray(np.asarray(image, np.uint8))
+    if encoding.startswith("bayer"):
+        if image.ndim != 2 or 8 * image.dtype.itemsize != int(encoding.lstrip("abcdefghijklmnopqrstuvwxyz_")):
+            raise _bad(path, f"not {encoding}")
+        return np.asarray(image)
+    return mono_if_gray(np.asarray(image))
 
 
 def mono_if_gray(image: Image, *, tint: int = 0) -> Image:

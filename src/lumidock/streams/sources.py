@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lumidock.camera import Camera
-from lumidock.datatypes import Array, Attitude, Detections, Frame, Unusable
+from lumidock.datatypes import ENCODINGS, Array, Attitude, Detections, Frame, Unusable
 from lumidock.errors import FrameError, InputError, extra
 from lumidock.geometry import rotation_from_quat_xyzw
 from lumidock.streams.images import SUFFIXES, read_image
@@ -194,8 +194,12 @@ def _in_order(rows: list[Row], read: Callable[[Row, int], Item]) -> Iterator[Ite
 
 def _sequence(folder: Path, rows: list[Row], attitudes: _Attitudes) -> Iterator[Item]:
     def read(row: Row, t_ns: int) -> Item:
-        image = read_image(_inside(folder / "frames", row["file"]))
-        return Frame(row["frame"], t_ns, image, attitudes.at(t_ns))
+        encoding = (row.get("encoding") or "").strip()
+        mosaic = encoding if encoding.startswith("bayer") else ""
+        if encoding and encoding not in ENCODINGS:
+            raise FrameError("bad_frame", f"frame {row['frame']}: encoding {encoding[:40]!r} is none of {', '.join(ENCODINGS)}")
+        image = read_image(_inside(folder / "frames", row["file"]), mosaic)
+        return Frame(row["frame"], t_ns, image, attitudes.at(t_ns), mosaic)
 
     return _in_order(rows, read)
 
