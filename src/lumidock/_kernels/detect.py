@@ -73,11 +73,11 @@ def search(
     `image` (H, W, C); `planes` 1, 3 or, for a mosaic, 4; `scale` makes 8-bit levels of its samples. `peak` (P, h, w)
     of its tiles, `level` (P, h, w) and `sigma` (h, w) of its blocks in samples, `spread` (P,), see `tiles`. `most`: candidates and measurements.
     """
-    seen[:] = 0
     count = 0
     clipped = q[CLIPPED] / scale
     contrast = q[CONTRAST] * np.sqrt(shared_by_plane.max())
     for p in range(len(peak)):
+        seen[:] = 0  # a tile may hold a light in one plane and noise in another
         for k in range(len(rects)):
             more = tiles.candidates(
                 peak[p], level[p], sigma, spread[p], contrast, clipped, rects[k], seen, found[count:]
@@ -434,7 +434,7 @@ def _describe(
     center[0] = where[patch.LEFT] + unit * (start[0] + center[0]) + shift_u + middle
     center[1] = where[patch.TOP] + unit * (start[1] + center[1]) + shift_v + middle
     fitted = False
-    if radius <= q[SMALL_PX] and sums[patch.EDGE] == 0.0:
+    if radius <= q[SMALL_PX] * (1.6 if planes == 4 else 1.0) and sums[patch.EDGE] == 0.0:
         sample_noise = noise if planes < 4 else max(noise / np.sqrt((weight**2).sum()), q[MIN_NOISE])
         width = patch.fit(
             image,
