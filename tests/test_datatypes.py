@@ -30,10 +30,25 @@ def test_a_frame_is_grey_or_color(shape):
 
 
 @pytest.mark.parametrize(
+    ("shape", "dtype", "encoding"),
+    [
+        ((4, 6, 3), np.uint8, "bayer_rggb8"),
+        ((4, 6), np.uint8, "bayer_rggb16"),
+        ((4, 6), np.uint16, "mono8"),
+        ((4, 6), np.uint8, "bgr8"),
+        ((4, 6), np.uint8, "bayer_rgbg8"),
+    ],
+)
+def test_an_encoding_that_does_not_fit_is_refused(shape, dtype, encoding):
+    with pytest.raises(ValueError, match="does not fit"):
+        Frame("a.png", 0, np.zeros(shape, dtype), encoding=encoding)
+
+
+@pytest.mark.parametrize(
     ("image", "match"),
     [
-        (np.zeros((4, 6), np.uint16), "wanted uint8"),
-        (np.zeros((4, 6)), "wanted uint8"),
+        (np.zeros((4, 6), np.int16), "wanted uint8 or uint16"),
+        (np.zeros((4, 6)), "wanted uint8 or uint16"),
         (np.zeros(4, np.uint8), "image has shape"),
         (np.zeros((4, 6, 1), np.uint8), "image has shape"),
         (np.zeros((4, 6, 4), np.uint8), "image has shape"),

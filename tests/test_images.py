@@ -43,6 +43,7 @@ def bomb(side):
 
 
 PNG, JPEG = encoded(".png", COLOR), encoded(".jpg", COLOR, cv2.IMWRITE_JPEG_QUALITY, 95)
+DEEP_COLOR, DEEP_GRAY = COLOR.astype(np.uint16) * 256 + 7, GRAY.astype(np.uint16) * 256 + 7
 PALETTE = chunk(b"PLTE", bytes([255, 0, 0, 0, 0, 255]))
 
 
@@ -62,12 +63,12 @@ def read(tmp_path):
         (encoded(".png", GRAY), GRAY),
         (encoded(".png", np.dstack([GRAY] * 3)), GRAY),
         (encoded(".png", ALPHA), COLOR),
-        (encoded(".png", COLOR.astype(np.uint16) * 256 + 7), COLOR),
-        (encoded(".png", GRAY.astype(np.uint16) * 256 + 7), GRAY),
-        (encoded(".png", ALPHA.astype(np.uint16) * 256 + 7), COLOR),
-        (png(2, 2, pixels([9, 0, 8, 255], [7, 1, 6, 2]), color_type=4), np.array([[9, 8], [7, 6]])),
-        (png(2, 1, PALETTE, pixels([0, 1]), color_type=3), np.array([[[0, 0, 255], [255, 0, 0]]])),
-        (png(8, 1, pixels([0b10100000]), depth=1), np.array([[255, 0, 255, 0, 0, 0, 0, 0]])),
+        (encoded(".png", DEEP_COLOR), DEEP_COLOR),
+        (encoded(".png", DEEP_GRAY), DEEP_GRAY),
+        (encoded(".png", ALPHA.astype(np.uint16) * 256 + 7), DEEP_COLOR),
+        (png(2, 2, pixels([9, 0, 8, 255], [7, 1, 6, 2]), color_type=4), np.array([[9, 8], [7, 6]], np.uint8)),
+        (png(2, 1, PALETTE, pixels([0, 1]), color_type=3), np.array([[[0, 0, 255], [255, 0, 0]]], np.uint8)),
+        (png(8, 1, pixels([0b10100000]), depth=1), np.array([[255, 0, 255, 0, 0, 0, 0, 0]], np.uint8)),
         (PNG + b"what a camera left behind the end" * 9, COLOR),
     ],
     ids=[
@@ -84,7 +85,7 @@ def read(tmp_path):
         "tail",
     ],
 )
-def test_every_png_becomes_mono8_or_bgr8(read, content, wanted):
+def test_every_png_becomes_mono_or_bgr_of_its_own_depth(read, content, wanted):
     image = read(content)
     assert image.dtype == wanted.dtype
     assert_array_equal(image, wanted)
