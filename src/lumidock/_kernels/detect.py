@@ -599,7 +599,7 @@ def _dim_glints(spots: Array, n: int, q: Array) -> None:
     for k in range(n):
         for m in range(n):
             near = np.hypot(spots[k, U] - spots[m, U], spots[k, V] - spots[m, V]) < q[GLINT_RADII] * spots[m, RADIUS]
-            weaker = spots[m, FLUX] > q[GLINT_RATIO] * spots[k, FLUX]
+            weaker = spots[m, FLUX] > q[GLINT_RATIO] * spots[k, FLUX] and spots[m, CORE] > 0.9 * spots[k, CORE]
             halo = m < k and spots[k, SATURATED] > 0.0 and spots[k, CORE] < 0.9 * spots[m, CORE]
             if m != k and near and (weaker or halo) and before[m] > q[GLINT_TRUST] * before[k]:
                 spots[k, P_LIGHT] = max(0.1 * before[k], 0.02)
