@@ -11,13 +11,14 @@ import sys
 import time
 from pathlib import Path
 
-from bench import contact_sheet, doors, images, rendering, speed, table1, visibility
+from bench import contact_sheet, detection, doors, images, rendering, speed, table1, visibility
 
 BENCHES = {
     "doors": doors,
     "table1": table1,
     "images": images,
     "speed": speed,
+    "detection": detection,
     "visibility": visibility,
     "rendering": rendering,
     "contact-sheet": contact_sheet,

@@ -1,106 +1,181 @@
-"""Milliseconds a stage and peak memory of the paper's method at 2448 x 2048, on one core."""
+"""Milliseconds from pixels to detections and to a fix, beside one pass over the frame and what others use; one core.
+
+Everything is timed in one process, in turns, in CPU time of the thread; before each timing the caches are filled with
+something else. "passes" are multiples of `np.max` over the same frame as mono.
+"""
 
 from __future__ import annotations
 
-import csv
+import os
 import platform
-import resource
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
 
-from bench.shipped import CAMERA_FILE, STATION_FILE, shipped_camera, shipped_station
-from lumidock.config import PaperConfig
-from lumidock.datatypes import Frame
-from lumidock.paper import PaperLocalizer, extract
-from lumidock.paper.layers import LayerDiscriminator, label_by_color
-from lumidock.sim.scenario import load_scenario, trajectory
-from lumidock.sim.sequence import render_frame
+from bench.shipped import shipped_camera, shipped_station
+from lumidock import detect, layers
+from lumidock.config import Config
+from lumidock.datatypes import Frame, Image
+from lumidock.localizer import Localizer
+from lumidock.paper import PaperLocalizer
+from lumidock.streams.sources import open_source
 
-_Z_M = (18.0, 9.0, 2.3)
-_ROUNDS = 15
+_Z_M, _ROUNDS, _SEED = (18.0, 9.0, 2.3), 7, 7100
+_KINDS = ("mono8", "bayer_rggb8", "bgr8")
+_OTHERS = np.zeros(1 << 26, np.uint8)
+Times = dict[str, list[float]]
 
 
-def frames() -> dict[float, list[Frame]]:
-    """Two consecutive frames of the approach at each range."""
-    scenario, station, camera = load_scenario("approach"), shipped_station(), shipped_camera()
-    t_ns, poses = trajectory(scenario, np.random.default_rng(0))
-    found: dict[float, list[Frame]] = {}
-    for z in _Z_M:
-        first = int(np.argmin(np.abs(poses[:, 2, 3] - z)))
-        for number in (first, first + 1):
-            rng = np.random.default_rng(number)
-            nothing = np.empty(0, np.int64)
-            image, _, _ = render_frame(scenario, station, camera, poses[number], np.empty((0, 2)), nothing, rng)
-            found.setdefault(z, []).append(Frame(str(number), int(t_ns[number]), image))
+def sequence(z_m: float) -> list[Frame]:
+    """Some consecutive frames of the approach around a distance."""
+    with TemporaryDirectory() as name:
+        command = [sys.executable, "-m", "lumidock", "sim", "approach", "--seed", str(_SEED), "--out", f"{name}/s"]
+        for setting in (f"path.start_z_m={z_m + 0.6}", f"path.end_z_m={z_m - 0.3}"):
+            command += ["--set", setting]
+        subprocess.run(command, check=True, capture_output=True)
+        return [frame for frame in open_source(Path(name) / "s").items() if isinstance(frame, Frame)]
+
+
+def as_kind(frame: Frame, kind: str) -> Frame:
+    """The frame as another camera would give it."""
+    bgr = frame.image
+    if kind == "bgr8":
+        return frame
+    if kind == "mono8":
+        return replace(frame, image=np.ascontiguousarray(bgr[:, :, 1]))
+    raw: Image = bgr[:, :, 1].copy()
+    raw[0::2, 0::2], raw[1::2, 1::2] = bgr[0::2, 0::2, 2], bgr[1::2, 1::2, 0]
+    return replace(frame, image=raw, encoding=kind)
+
+
+def timed(times: Times, name: str, job: Callable[[], object]) -> None:
+    """Add the milliseconds of a job that finds cold caches."""
+    _OTHERS.max()
+    start = time.thread_time()
+    job()
+    times[name].append(1e3 * (time.thread_time() - start))
+
+
+def lumidock_round(times: Times, frames: list[Frame]) -> None:
+    """One run over the frames: first frame searched in full, later ones where the track holds."""
+    localizer, config = Localizer(shipped_station(), shipped_camera()), Config()
+    full = detect.Scan(frames[0], config.detect)
+    timed(times, "np.max over it", lambda: frames[0].image.max())
+
+    def find(frame: Frame, scan: detect.Scan, expected: np.ndarray | None) -> None:
+        layers.label(frame, detect.lights(frame, config.detect, scan, expected), config.label)
+
+    for frame in frames:
+        expected = localizer.foreseen(frame)
+        if expected is None:
+            timed(times, "full search", lambda f=frame: find(f, full, None))
+            timed(times, "full search to fix", lambda f=frame: localizer.process(f))
+            continue
+        assert localizer.scan is not None
+        timed(times, "tracked search", lambda f=frame, e=expected: find(f, localizer.scan, e))
+        timed(times, "tracked search to fix", lambda f=frame: localizer.process(f))
+
+
+def blobs_and_pnp(frame: Frame) -> None:
+    """What many write first: OpenCV's blobs and a pose from the lights as if all were named."""
+    parameters = cv2.SimpleBlobDetector_Params()
+    parameters.filterByColor, parameters.blobColor = True, 255
+    parameters.filterByArea, parameters.minArea = True, 4.0
+    cv2.SimpleBlobDetector_create(parameters).detect(frame.image)
+    station, camera = shipped_station(), shipped_camera()
+    uv = camera.project(station.p_dock * (1.0, -1.0, -1.0) + (0.0, 0.0, 9.0))
+    uv = np.asarray(uv[0] if isinstance(uv, tuple) else uv)
+    matrix = np.array([[camera.focal_px[0], 0, 1224], [0, camera.focal_px[1], 1024], [0, 0, 1.0]])
+    cv2.solvePnP(station.p_dock, uv, matrix, np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
+
+
+def april_tags(frame: Frame) -> None:
+    """AprilTag 36h11 on the same frame."""
+    tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    cv2.aruco.ArucoDetector(tags, cv2.aruco.DetectorParameters()).detectMarkers(frame.image)
+
+
+def growth(spurious: tuple[int, ...]) -> dict[str, float]:
+    """Median ms of a full search of a frame with so many blobs, of pure noise and of the most blobs that fit."""
+    rng, config, found = np.random.default_rng(_SEED), Config(), {}
+    for count in (*spurious, 10_000, 0):
+        image = rng.normal(20.0, 30.0 if count == 0 else 2.0, (2048, 2448))
+        for u, v in rng.uniform(12, 2030, (count, 2)).astype(int):
+            image[v - 3 : v + 4, u - 3 : u + 4] += 120.0 * _BLOB
+        frame = Frame("0", 0, np.clip(image, 0, 255).astype(np.uint8))
+        scan, times = detect.Scan(frame, config.detect), defaultdict(list)
+        for _ in range(5):
+            timed(times, "search", lambda f=frame, s=scan: detect.lights(f, config.detect, s))
+        found["pure noise" if count == 0 else f"{count} blobs"] = float(np.median(times["search"]))
     return found
 
 
-def _milliseconds(job: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    job()
-    return 1e3 * (time.perf_counter() - start)
+_BLOB = np.exp(-0.5 * (np.arange(-3, 4)[:, None] ** 2 + np.arange(-3, 4)[None] ** 2) / 1.5**2)
+
+_START = """
+import time; start = time.perf_counter()
+import numpy as np
+from bench.shipped import shipped_camera, shipped_station
+from lumidock import Frame, Localizer
+localizer = Localizer(shipped_station(), shipped_camera())
+image = np.load({path!r})
+for k in range(3):
+    localizer.process(Frame(str(k), k * 150_000_000, np.ascontiguousarray(np.roll(image, k, axis=0))))
+print(time.perf_counter() - start)
+import resource; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
+"""
 
 
-def _stages(first: Frame, second: Frame) -> dict[str, float]:
-    """One timing of each stage on the second frame, with the first as history."""
-    station, camera, config = shipped_station(), shipped_camera(), PaperConfig()
-    mono = np.ascontiguousarray(second.image[:, :, 1])
-    timing = {"np.max over a mono frame": _milliseconds(lambda: np.max(mono))}
-    timing["extract"] = _milliseconds(lambda: extract.lights(second, config.extract))
-    spots = extract.lights(second, config.extract)
-    timing["layers"] = _milliseconds(lambda: label_by_color(second, spots, config.layers))
-    labelled = label_by_color(second, spots, config.layers)
-    rear = LayerDiscriminator(config.layers).rear(labelled)
-    localizer = PaperLocalizer(station, camera, config)
-    localizer.process(first)
-    seen = max(sum(int(group.sum()) >= 4 for group in (rear, ~rear)), 1)
-    matching = _milliseconds(lambda: localizer.process_detections(labelled))
-    timing["match and pose, per layer seen"] = matching / seen
-    fresh = PaperLocalizer(station, camera, config)
-    timing["whole frame, first"] = _milliseconds(lambda: fresh.process(first))
-    timing["whole frame, next"] = _milliseconds(lambda: fresh.process(second))
-    return timing
-
-
-def _peak_mib(pictures: list[Frame]) -> float:
-    """Peak memory of `lumidock run` over the frames, as its own process."""
+def start_up(frame: Frame) -> tuple[float, float, float]:
+    """Seconds to the third frame with empty and with warm caches of compiled code, and peak memory in MiB."""
     with TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "frames").mkdir()
-        with (folder / "timestamps.csv").open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(("frame", "file", "t_ns"))
-            for number, frame in enumerate(pictures):
-                cv2.imwrite(str(folder / "frames" / f"{number}.jpg"), frame.image)
-                writer.writerow((number, f"{number}.jpg", number * 150_000_000))
-        command = [sys.executable, "-m", "lumidock", "run", name, "--out", str(folder / "run")]
-        subprocess.run([*command, "--station", STATION_FILE, "--camera", CAMERA_FILE], check=True, capture_output=True)
-    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024.0
+        np.save(f"{name}/frame.npy", frame.image)
+        code = _START.format(path=f"{name}/frame.npy")
+        environment = os.environ | {"NUMBA_CACHE_DIR": f"{name}/cache"}
+        runs = []
+        for _ in range(2):
+            done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=environment)
+            runs.append([float(line) for line in done.stdout.split()])
+    return runs[0][0], runs[1][0], runs[1][1]
 
 
 def main() -> tuple[dict[str, object], list[str]]:
-    """Medians over interleaved rounds, one row a stage and one column a range."""
+    """Medians over rounds in turns: a row a job, a column a distance."""
     cv2.setNumThreads(1)
-    pictures = frames()
-    rounds: dict[float, list[dict[str, float]]] = {z: [] for z in _Z_M}
-    _stages(*pictures[_Z_M[0]])  # compiles
-    for _ in range(_ROUNDS):
-        for z in _Z_M:
-            rounds[z].append(_stages(*pictures[z]))
-    lines = ["| ms, median (slowest) | " + " | ".join(f"{z:g} m" for z in _Z_M) + " |", "|---|" + "---|" * len(_Z_M)]
-    for stage in rounds[_Z_M[0]][0]:
-        cells = (np.array([timing[stage] for timing in rounds[z]]) for z in _Z_M)
-        lines.append(f"| {stage} | " + " | ".join(f"{np.median(c):.2f} ({c.max():.2f})" for c in cells) + " |")
-    peak = _peak_mib([frame for group in pictures.values() for frame in group])
-    lines += ["", f"Peak memory of a run: {peak:.0f} MiB. {machine()}"]
-    content = {"rounds": {str(z): timings for z, timings in rounds.items()}, "peak_mib": peak, "machine": machine()}
+    frames = {(z, kind): [as_kind(f, kind) for f in sequence(z)] for z in _Z_M for kind in _KINDS}
+    times: dict[tuple[float, str], Times] = defaultdict(lambda: defaultdict(list))
+    for turn in range(_ROUNDS + 1):
+        if turn == 1:  # the first one compiled
+            times.clear()
+        for key, some in frames.items():
+            lumidock_round(times[key], some)
+            if key[1] == "bgr8" and turn < 4:
+                timed(times[key], "paper's method", lambda f=some[0]: PaperLocalizer(shipped_station(), shipped_camera()).process(f))
+            if key[1] == "mono8" and turn < 4:
+                timed(times[key], "SimpleBlobDetector + SQPnP", lambda f=some[0]: blobs_and_pnp(f))
+                timed(times[key], "AprilTag 36h11", lambda f=some[0]: april_tags(f))
+    one_pass = float(np.median([x for (_, kind), t in times.items() if kind == "mono8" for x in t["np.max over it"]]))
+    lines = ["| ms (passes) | " + " | ".join(f"{z:g} m" for z in _Z_M) + " |", "|---|" + "---|" * len(_Z_M)]
+    content: dict[str, object] = {"pass_ms": one_pass}
+    for kind in _KINDS:
+        for job in sorted({job for z in _Z_M for job in times[z, kind]}):
+            medians = [float(np.median(times[z, kind][job])) if times[z, kind][job] else float("nan") for z in _Z_M]
+            content[f"{kind}: {job}"] = medians
+            lines.append(f"| {kind}: {job} | " + " | ".join(f"{m:.2f} ({m / one_pass:.1f})" for m in medians) + " |")
+    content["growth_ms"] = grown = growth((2, 20, 200))
+    cold_s, warm_s, peak = start_up(frames[9.0, "bgr8"][0])
+    content |= {"start_cold_s": cold_s, "start_warm_s": warm_s, "peak_mib": peak, "machine": machine()}
+    lines += ["", "Full search of a mono frame, ms: " + ", ".join(f"{k} {v:.2f}" for k, v in grown.items()) + "."]
+    lines.append(f"Start to the third frame: {cold_s:.1f} s while compiling, {warm_s:.2f} s after; peak memory {peak:.0f} MiB.")
+    lines += ["", machine()]
     return content, lines
 
 
@@ -111,3 +186,5 @@ def machine() -> str:
         platform.machine(),
     )
     return f"Machine: {model}, one core, Python {platform.python_version()}, OpenCV {cv2.__version__}."
+
+

@@ -32,7 +32,7 @@ class Localizer:
         self.station, self.camera, self.cold = station, camera, cold
         self.config = config or Config()
         self._plan = match.plan(station, camera, self.config.match)
-        self._scan: detect.Scan | None = None
+        self.scan: detect.Scan | None = None
         self.forget()
 
     def forget(self) -> None:
@@ -51,13 +51,14 @@ class Localizer:
         if (width, height) != (self.camera.width, self.camera.height):
             wanted = f"{self.camera.width}x{self.camera.height}"
             raise FrameError("bad_frame", f"frame {frame.name} is {width}x{height}, the calibration {wanted}")
-        if self._scan is None or not self._scan.fits(frame):
-            self._scan = detect.Scan(frame, self.config.detect)
-        detections = detect.lights(frame, self.config.detect, self._scan, self._expected(frame.t_ns))
+        if self.scan is None or not self.scan.fits(frame):
+            self.scan = detect.Scan(frame, self.config.detect)
+        detections = detect.lights(frame, self.config.detect, self.scan, self.foreseen(frame))
         return self.process_detections(layers.label(frame, detections, self.config.label))
 
-    def _expected(self, t_ns: int) -> Array | None:
+    def foreseen(self, frame: Frame) -> Array | None:
         """Where the lights will be (n, 3) u, v, reach px, while the track holds; None asks for a full search."""
+        t_ns = frame.t_ns
         if self.cold or not self.locked or self._failures or self._last is None or t_ns <= self._last.t_ns:
             return None
         belief = self.beliefs[0]

@@ -25,8 +25,9 @@ _AS_IT_IS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENT
 def read_image(path: Path, encoding: str = "") -> Image:
     """Read a PNG or JPEG as (H, W) mono or, where it has colour, (H, W, 3) BGR, of 8 or 16 bits as the file has them.
 
-    A file that `encoding` calls a mosaic has one channel. The header is read before any pixel, and the file must be complete: with zeros in place of its second half, as a
-    power cut leaves it, the decoder takes it for whole. Raises: FrameError `bad_frame`, one line.
+    A file that `encoding` calls a mosaic has one channel. The header is read before any pixel, and the file must be
+    complete: with zeros in place of its second half, as a power cut leaves it, the decoder takes it for whole.
+    Raises: FrameError `bad_frame`, one line.
     """
     try:
         status = path.stat()
@@ -37,10 +38,10 @@ def read_image(path: Path, encoding: str = "") -> Image:
         data = path.read_bytes()
     except OSError as error:
         raise _bad(path, error.strerror or "cannot be read") from None
-    return decode_image(data, path)
+    return decode_image(data, path, encoding)
 
 
-def decode_image(data: bytes, path: object) -> Image:
+def decode_image(data: bytes, path: object, encoding: str = "") -> Image:
     """The picture in the bytes of a PNG or JPEG; `path` is what an error calls it. Raises: as `read_image`."""
     width, height = _size_in_header(path, data)
     if not 0 < width * height <= MAX_PIXELS:
