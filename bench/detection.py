@@ -1,4 +1,4 @@
-"""Detections before any naming, over rendered sequences: recall, false lamps, errors of centres and their covariances."""
+"""Detections before any naming, over rendered sequences: recall, false lamps, centres and their covariances."""
 
 from __future__ import annotations
 
@@ -80,7 +80,9 @@ def measure(folder: Path) -> dict[str, float]:
         for i in np.flatnonzero(owner >= 0):
             row = lit[owner[i]]
             lamps_low += found.p_light[i] < 0.5 and float(row["snr"]) > 12.0
-            kind = ("blue" if row["light"].startswith("R") else "white") + _size_kind(frame, found, i, float(row["snr"]))
+            kind = ("blue" if row["light"].startswith("R") else "white") + _size_kind(
+                frame, found, i, float(row["snr"])
+            )
             e = found.uv[i] - (float(row["u_px"]), float(row["v_px"]))
             errors[kind].append(float(np.hypot(*e)))
             nees[kind].append(float(e @ np.linalg.solve(found.cov_px2[i], e)))

@@ -142,7 +142,9 @@ def start_up(frame: Frame) -> tuple[float, float, float]:
         environment = os.environ | {"NUMBA_CACHE_DIR": f"{name}/cache"}
         runs = []
         for _ in range(2):
-            done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=environment)
+            done = subprocess.run(
+                [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=environment
+            )
             runs.append([float(line) for line in done.stdout.split()])
     return runs[0][0], runs[1][0], runs[1][1]
 
@@ -158,7 +160,11 @@ def main() -> tuple[dict[str, object], list[str]]:
         for key, some in frames.items():
             lumidock_round(times[key], some)
             if key[1] == "bgr8" and turn < 4:
-                timed(times[key], "paper's method", lambda f=some[0]: PaperLocalizer(shipped_station(), shipped_camera()).process(f))
+                timed(
+                    times[key],
+                    "paper's method",
+                    lambda f=some[0]: PaperLocalizer(shipped_station(), shipped_camera()).process(f),
+                )
             if key[1] == "mono8" and turn < 4:
                 timed(times[key], "SimpleBlobDetector + SQPnP", lambda f=some[0]: blobs_and_pnp(f))
                 timed(times[key], "AprilTag 36h11", lambda f=some[0]: april_tags(f))
@@ -174,7 +180,9 @@ def main() -> tuple[dict[str, object], list[str]]:
     cold_s, warm_s, peak = start_up(frames[9.0, "bgr8"][0])
     content |= {"start_cold_s": cold_s, "start_warm_s": warm_s, "peak_mib": peak, "machine": machine()}
     lines += ["", "Full search of a mono frame, ms: " + ", ".join(f"{k} {v:.2f}" for k, v in grown.items()) + "."]
-    lines.append(f"Start to the third frame: {cold_s:.1f} s while compiling, {warm_s:.2f} s after; peak memory {peak:.0f} MiB.")
+    lines.append(
+        f"Start to the third frame: {cold_s:.1f} s while compiling, {warm_s:.2f} s after; peak memory {peak:.0f} MiB."
+    )
     lines += ["", machine()]
     return content, lines
 
@@ -186,5 +194,3 @@ def machine() -> str:
         platform.machine(),
     )
     return f"Machine: {model}, one core, Python {platform.python_version()}, OpenCV {cv2.__version__}."
-
-

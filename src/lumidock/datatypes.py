@@ -49,9 +49,9 @@ class Attitude:
 class Frame:
     """One picture as the camera gives it, exposed at `t_ns`; `name` as its source calls it.
 
-    `image` (H, W) mono or raw mosaic, or (H, W, 3) BGR, of 8 or 16 bits; 16 bits use their full scale. `encoding` as ROS
-    calls it; empty for mono or BGR by shape, `bayer_rggb8`, `bayer_grbg16` and so on for a mosaic, whose letters are the
-    first two pixels of the first two rows.
+    `image` (H, W) mono or raw mosaic, or (H, W, 3) BGR, of 8 or 16 bits; 16 bits use their full scale. `encoding` as
+    ROS calls it; empty for mono or BGR by shape, `bayer_rggb8`, `bayer_grbg16` and so on for a mosaic, whose letters
+    are the first two pixels of the first two rows.
     """
 
     name: str

@@ -1,12 +1,13 @@
 """The lights in a frame: centres with their covariance, radii, fluxes, and how much each looks like a lamp.
 
-The whole frame is touched once, for the largest value of every 8 x 8 tile. Tiles that stand out of their surroundings are
-looked at in a window of their own. Mono, BGR and raw Bayer of 8 or 16 bits are taken as they come.
+The whole frame is touched once, for the largest value of every 8 x 8 tile. Tiles that stand out of their surroundings
+are looked at in a window of their own. Mono, BGR and raw Bayer of 8 or 16 bits are taken as they come.
 
-The centre of a small light is the maximum-likelihood position of a round Gaussian on each colour's own samples: nothing is
-more precise on a spot of a few pixels, and it knows of the mosaic. Of a larger one, or one that is saturated, it is the
-balance of what stands over the level at which the spot is round and alone, which asks of the profile only that it is
-symmetric. Either comes with the covariance that the noise around the spot gives it, and what remains without noise.
+The centre of a small light is the maximum-likelihood position of a round Gaussian on each colour's own samples:
+nothing is more precise on a spot of a few pixels, and it knows of the mosaic. Of a larger one, or one that is
+saturated, it is the balance of what stands over the level at which the spot is round and alone, which asks of the
+profile only that it is symmetric. Either comes with the covariance that the noise around the spot gives it, and what
+remains without noise.
 """
 
 from __future__ import annotations
@@ -107,10 +108,11 @@ def _parameters(config: DetectConfig, longer_side: int, least_noise: float) -> A
 
 
 def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None, expected: Array | None = None) -> Detections:
-    """Find the lights of a frame: in all of it, or where they are expected and were seen, and in the next part of the rest.
+    """Find the lights of a frame: in all of it, or where they are expected and in the next part of the rest.
 
-    `expected` (n, 3) u, v and reach px of the lights foretold, for a `scan` that has seen the frame before; the rest comes
-    round in `SWEEP` frames. The layer is not known yet. Takes any picture; one without lights gives no detections.
+    `expected` (n, 3) u, v and reach px of the lights foretold, for a `scan` that has seen the frame before; the rest
+    comes round in `SWEEP` frames. The layer is not known yet. Takes any picture; one without lights gives no
+    detections.
     """
     if min(frame.image.shape[:2]) < _LEAST_SIDE:
         return _detections(frame, np.empty((0, kernels.COLUMNS)))

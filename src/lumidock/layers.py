@@ -58,7 +58,7 @@ def _order(encoding: str) -> Indices:
 
 
 def _from_signal(signal: Array, sigma: Array, config: LabelConfig) -> Array:
-    """P(rear) (N,) from the linear light (N, 3) of B, G, R over the background and its error; NaN where it is too weak."""
+    """P(rear) (N,) from the linear light (N, 3) of B, G, R over the background and its error; NaN where too weak."""
     other = np.maximum(signal[:, 1], signal[:, 2])
     other_sigma = np.where(signal[:, 2] > signal[:, 1], sigma[:, 2], sigma[:, 1])
     blue, rest = np.maximum(signal[:, 0], sigma[:, 0]), np.maximum(other, other_sigma)

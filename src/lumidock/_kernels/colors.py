@@ -27,10 +27,11 @@ def colors(
     signal: Array,
     sigma: Array,
 ) -> None:
-    """Write `signal` (N, 3), light of B, G, R over the background, and its error `sigma` (N, 3) of the spots `uv` (N, 2).
+    """Write `signal` (N, 3), light of B, G, R over the background of the spots `uv` (N, 2), and its error `sigma`.
 
-    `order` (4,): colour of each plane. `linear` (256,) undoes the camera's gamma. A saturated core is white whatever the
-    lamp, so the ring around it is asked, from `clear_px` beyond its edge to `ring` radii + px. NaN where there is none.
+    `order` (4,): colour of each plane. `linear` (256,) undoes the camera's gamma. A saturated core is white whatever
+    the lamp, so the ring around it is asked, from `clear_px` beyond its edge to `ring` radii + px. NaN where there is
+    none.
     """
     pitch = 2 if planes == 4 else 1
     value = np.empty(4)
@@ -41,7 +42,7 @@ def colors(
         reach = 2.0 * outer + 2.0
         step = pitch * (1 + int(2.0 * reach) // (_SAMPLES * pitch))
         inner = max(radius[n], least_reach_px)
-        burnt = _is_burnt(image, planes, scale, clipped, u, v, inner)
+        burnt = _is_burnt(image, scale, clipped, u, v, inner)
         low, high = (radius[n] + clear_px, outer) if burnt else (0.0, inner)
         fine = max(step // 2 // pitch * pitch, pitch) if high < 8.0 else step
         total, count, dark = np.zeros(3), np.zeros(3), 0
@@ -92,7 +93,7 @@ def _light(value: float, linear: Array) -> float:
 
 
 @njit(cache=True)
-def _is_burnt(image: Image, planes: int, scale: float, clipped: float, u: float, v: float, reach: float) -> bool:
+def _is_burnt(image: Image, scale: float, clipped: float, u: float, v: float, reach: float) -> bool:
     step = 1 + int(reach) // 8
     for y in range(max(int(v - reach), 0), min(int(v + reach) + 2, image.shape[0]), step):
         for x in range(max(int(u - reach), 0), min(int(u + reach) + 2, image.shape[1]), step):

@@ -71,7 +71,8 @@ def search(
     """Write the spots of the tiles in `rects` (n, 4) to `spots` (N, COLUMNS), the strongest first; returns how many.
 
     `image` (H, W, C); `planes` 1, 3 or, for a mosaic, 4; `scale` makes 8-bit levels of its samples. `peak` (P, h, w)
-    of its tiles, `level` (P, h, w) and `sigma` (h, w) of its blocks in samples, `spread` (P,), see `tiles`. `most`: candidates and measurements.
+    of its tiles, `level` (P, h, w) and `sigma` (h, w) of its blocks in samples, `spread` (P,), see `tiles`. `most`:
+    candidates and measurements.
     """
     count = 0
     clipped = q[CLIPPED] / scale
@@ -185,7 +186,7 @@ def _middle_of_run(image: Image, planes: int, p: int, v: int, u: int, dv: int, d
 
 @njit(cache=True)
 def _rank(image: Image, planes: int, p: int, v: int, u: int) -> int:
-    """Order of a pixel in map `p`: by its value there, and among equals by all channels, which tell a saturated core."""
+    """Order of a pixel in map `p`: by its value there, among equals by all channels, which tell a saturated core."""
     if planes == 1:
         return int(image[v, u, 0])
     if planes == 4:
@@ -241,7 +242,7 @@ def _measure(
     spots: Array,
     n: int,
 ) -> int:
-    """Measure the spot of one candidate tile into `spots[n]`: 1 if there is one, 0 if not, -1 if it was cheap to say so."""
+    """Measure the spot of one candidate tile into `spots[n]`: 1 if there is one, 0 if not, -1 if that was cheap."""
     weight, where, start = np.zeros(4), np.zeros(5), np.zeros(2, np.int64)
     radius, clipped = 0.0, scale * peak[:, i, j].max() >= q[CLIPPED]
     if clipped:
@@ -336,9 +337,9 @@ def _level(
     spots: Array,
     n: int,
 ) -> float:
-    """Grow the spot at the lowest share of its peak where it is round and alone, at the lowest where it is alone otherwise.
+    """Grow the spot at the lowest share of its peak where it is round and alone.
 
-    Returns the share, 0 where the spot is never alone. A saturated core in one plane is swollen at half height by its
+    If it is round nowhere, at the lowest where it is alone. Returns the share, 0 where the spot is never alone. A saturated core in one plane is swollen at half height by its
     halo, which no colour tells apart: there the lowest share is left out.
     """
     top = _peak_value(window[0], where, start)
@@ -368,7 +369,7 @@ def _level(
 
 
 @njit(cache=True)
-def _holds_another(stamp: Array, where: Array, mark: int, spots: Array, n: int) -> bool:
+def _holds_another(stamp: Image, where: Array, mark: int, spots: Array, n: int) -> bool:
     """Whether the grown region covers the centre of a spot found before."""
     for k in range(n):
         x = int((spots[k, U] - where[patch.LEFT]) / where[patch.UNIT] + 0.5)
@@ -430,9 +431,8 @@ def _describe(
     patch.balance(sums, variance * shared, center, cov)
     cov *= unit * unit
     shift_u, shift_v = _plane_shift(weight, planes, spot[SATURATED] > 0.0)
-    middle = 0.5 * (unit / pitch - 1.0) * 0.0
-    center[0] = where[patch.LEFT] + unit * (start[0] + center[0]) + shift_u + middle
-    center[1] = where[patch.TOP] + unit * (start[1] + center[1]) + shift_v + middle
+    center[0] = where[patch.LEFT] + unit * (start[0] + center[0]) + shift_u
+    center[1] = where[patch.TOP] + unit * (start[1] + center[1]) + shift_v
     fitted = False
     if radius <= q[SMALL_PX] * (1.6 if planes == 4 else 1.0) and sums[patch.EDGE] == 0.0:
         sample_noise = noise if planes < 4 else max(noise / np.sqrt((weight**2).sum()), q[MIN_NOISE])
@@ -484,7 +484,7 @@ def _plane_shift(weight: Array, planes: int, clipped: bool) -> tuple[float, floa
     """Where the samples of a cell lie on the average: planes of a mosaic stand a pixel apart."""
     if planes != 4:
         return 0.0, 0.0
-    # the weight of a plane goes with its share of the light, its part of the sum with the square; clipped, all are alike
+    # a plane's weight goes with its share of the light, its part of the sum with the square; clipped, all are alike
     part = weight if clipped else weight**2
     total = part.sum()
     return float((part[1] + part[3]) / total), float((part[2] + part[3]) / total)
@@ -526,7 +526,7 @@ def _is_known(spots: Array, n: int) -> bool:
 
 
 @njit(cache=True)
-def _own(seen: Image, stamp: Array, where: Array, start: Indices) -> None:
+def _own(seen: Image, stamp: Image, where: Array, start: Indices) -> None:
     """Mark the tiles that the grown region touches: nobody looks there again."""
     mark, t = stamp[start[1], start[0]], tiles.TILE_PX
     unit = int(where[patch.UNIT])

@@ -1,8 +1,8 @@
 """One light in a small window: cut out, flattened, grown at the level where it is round and alone, and its centre.
 
 Samples come as (H, W, C) of an unsigned type, 1 or 3 channels, or one channel that is a Bayer mosaic. A window is one
-plane of floats in 8-bit grey levels: the planes (colours) weighted by how far the light stands out in each. Large windows
-are thinned out.
+plane of floats in 8-bit grey levels: the planes (colours) weighted by how far the light stands out in each. Large
+windows are thinned out.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def weigh_clipped(
 ) -> float:
     """The same for a saturated light: only the planes in which it is smallest count. Returns its radius there, or 0.
 
-    A saturated core in its halo is small where its colour is weak: the red of a blue lamp. The radius is that of the first
-    ring at half height over the ring three times as wide; a plane must stand out by `least`.
+    A saturated core in its halo is small where its colour is weak: the red of a blue lamp. The radius is that of the
+    first ring at half height over the ring three times as wide; a plane must stand out by `least`.
     """
     weight[:] = 0.0
     radii = np.full(4, np.inf)
@@ -189,8 +189,8 @@ def cut(
 def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tuple[float, float]:
     """Level and spread (1 sigma) of the ring of `radius` around a sample, whose slope is taken out of the patch.
 
-    The slope is what a neighbour's halo adds: by least squares, from opposite samples within Tukey's fences. The level is
-    the mean of the middle half, the spread from the quartiles.
+    The slope is what a neighbour's halo adds: by least squares, from opposite samples within Tukey's fences. The level
+    is the mean of the middle half, the spread from the quartiles.
     """
     columns, rows = int(where[COLUMNS]), int(where[ROWS])
     values, ordered = np.empty(_RING), np.empty(_RING)
@@ -346,8 +346,7 @@ def moments(sums: Array) -> tuple[float, float, float]:
 
 @njit(cache=True)
 def balance(sums: Array, variance: float, center: Array, cov: Array) -> None:
-    """Write the weighted centre (2,) of a region, relative to its start, and its covariance `cov` (3,) for noise of
-    `variance` a sample."""
+    """Write a region's weighted centre (2,), relative to its start, and its covariance (3,) by noise of `variance`."""
     x, y = sums[WX] / sums[W], sums[WY] / sums[W]
     center[0], center[1] = x, y
     cov[0] = sums[XX] - 2.0 * x * sums[X] + sums[N] * x * x
@@ -372,9 +371,9 @@ def fit(
     """Move `center` (2,) to the maximum-likelihood position of a round Gaussian; its covariance goes to `cov` (3,).
 
     Position and width are common, amplitude and background are of each plane and eliminated (variable projection), so
-    that a mosaic's coarse planes bias nothing; saturated samples are left out, which is how the wings of a small clipped
-    light give its centre. The residuals scale the covariance. Returns the width, 0 where the fit does not settle, which
-    leaves everything as it was.
+    that a mosaic's coarse planes bias nothing; saturated samples are left out, which is how the wings of a small
+    clipped light give its centre. The residuals scale the covariance. Returns the width, 0 where the fit does not
+    settle, which leaves everything as it was.
     """
     reach = min(max(int(np.ceil(2.2 * width)) + 1, 3 if planes < 4 else 4), _FIT_REACH)
     u0, v0 = int(np.floor(center[0] + 0.5)), int(np.floor(center[1] + 0.5))
@@ -420,7 +419,7 @@ def fit(
     if not solved:
         return 0.0
     center[0], center[1] = u, v
-    misfit = _odd_misfit(z, ex, ey, left, top, parts, noise, signal_noise, amplitude, ground, u, v)
+    misfit = _odd_misfit(z, ex, ey, left, top, parts, noise, signal_noise, amplitude, u, v)
     cov[0], cov[1], cov[2] = inverse[0] * misfit, inverse[1] * misfit, inverse[2] * misfit
     return s
 
@@ -436,7 +435,6 @@ def _odd_misfit(
     noise: float,
     signal_noise: float,
     amplitude: Array,
-    ground: Array,
     u: float,
     v: float,
 ) -> float:

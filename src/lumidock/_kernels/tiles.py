@@ -22,11 +22,12 @@ _HIGH = np.array([1, 3, 5, 7, 2, 3, 6, 7, 2, 6, 4, 5, 6, 7, 4, 5, 2, 4, 6])
 
 @njit(cache=True)
 def refresh(rows: Image, planes: int, rect: Indices, peak: Image, line: Image) -> int:
-    """Write the largest values of each tile of `rect` (first and last row, first and last column) into `peak` (P, h, w).
+    """Write the largest values of each tile of `rect` into `peak` (P, h, w); `rect` is two rows and two columns.
 
     One map for mono; for `planes` 3 one for each channel; for a mosaic, `planes` 4, the corners of its 2 x 2 cell that
     stand on one diagonal are one map if they are alike, so that there are three: a light in one colour must not hide
-    behind the background of another. `line` (2, n) is scratch, n = (W + 16) times the channels. Returns the largest value.
+    behind the background of another. `line` (2, n) is scratch, n = (W + 16) times the channels. Returns the largest
+    value.
     """
     height = len(rows)
     channels = 3 if planes == 3 else 1
@@ -139,14 +140,16 @@ def survey(
     sigma: Array,
     by_plane: Array,
 ) -> None:
-    """Bring the rows of blocks from `blocks[0]` to `blocks[1]` up to date: `peak` of their tiles (P, h, w), and of blocks
-    `level` (P, h, w), the median of their tiles, `sigma` (h, w), the noise of a sample, and `by_plane` (2, P, h, w / 4).
+    """Bring the rows of blocks from `blocks[0]` to `blocks[1]` up to date.
 
-    That is the noise of each plane, and what the sums of eight neighbours make of it over the root of eight: demosaicing and
-    JPEG share noise. One row of pixels speaks for a row of blocks, by second differences, which no slope reaches, of every
-    other pixel, which a mosaic does not.
+    That is `peak` of their tiles (P, h, w), and of blocks
+    `level` (P, h, w), the median of their tiles, `sigma` (h, w), the noise of a sample, and `by_plane` (2, P, h, w /
+    4).
+
+    That is the noise of each plane, and what the sums of eight neighbours make of it over the root of eight:
+    demosaicing and JPEG share noise. One row of pixels speaks for a row of blocks, by second differences, which no
+    slope reaches, of every other pixel, which a mosaic does not.
     """
-    channels = 3 if planes == 3 else 1
     rect = np.array([0, 0, 0, peak.shape[2]])
     for b in range(blocks[0], blocks[1]):
         rect[0], rect[1] = b * BLOCK, min((b + 1) * BLOCK, peak.shape[1])
@@ -195,8 +198,11 @@ def settle(
     spread: Array,
     shared: Array,
 ) -> None:
-    """What a frame's blocks say together: smooth `level` and `sigma`, and of each plane the `spread`, its noise over sigma,
-    and how many times over, `shared` (4,), noise averages out less than that of independent samples, up to `most`."""
+    """Write what a frame's blocks say together.
+
+    Smooth `level` and `sigma`, and of each plane the `spread`, its noise over sigma,
+    and how many times over, `shared` (4,), noise averages out less than that of independent samples, up to `most`.
+    """
     for p in range(len(level)):
         _smoothed(raw_level[p], level[p])
     _smoothed(raw_sigma, sigma)
@@ -303,12 +309,12 @@ def candidates(
     seen: Image,
     found: Array,
 ) -> int:
-    """Write the tiles of `rect` that may hold a light's peak to `found` (n, 4): row, column, sigmas over the background.
+    """Write the tiles of `rect` that may hold a light's peak to `found`: row, column, sigmas over the background.
 
     Of one plane: `peak` (h, w), `level` of its blocks, and `spread` times `sigma` for its noise. Such a tile clears its
-    background by `contrast` sigmas; no two neighbours on opposite sides are brighter together, as on a slope, and next to
-    it or a few tiles away they are darker by a margin, as on a halo they are not. Tiles that are `seen` (h, w) are left
-    out, and the others become it. Returns how many there are.
+    background by `contrast` sigmas; no two neighbours on opposite sides are brighter together, as on a slope, and next
+    to it or a few tiles away they are darker by a margin, as on a halo they are not. Tiles that are `seen` (h, w) are
+    left out, and the others become it. Returns how many there are.
     """
     count, least = 0, np.empty(peak.shape[1], peak.dtype)
     for i in range(rect[0], rect[1]):

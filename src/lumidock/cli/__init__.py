@@ -312,6 +312,18 @@ def _seeds(text: str) -> tuple[int, int]:
     return int(first), int(stop)
 
 
+@app.command("warm", epilog=example("lumidock warm"))
+def _warm() -> None:
+    """Compile everything ahead, once on a machine, so that no run waits for it."""
+    from lumidock.warm import steps
+
+    dock = load_station(shipped_or_path("station", DEFAULT_STATION))
+    lens = load_camera(shipped_or_path("camera", DEFAULT_CAMERA))
+    for name in steps(dock, lens):
+        print(f"compiling for {name} ...", flush=True)
+    print("compiled; kept in numba's cache")
+
+
 @app.command("demo", epilog=example("lumidock demo --force"))
 def _demo(
     out: Out = Path("demo-out"),

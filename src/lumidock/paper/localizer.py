@@ -39,11 +39,13 @@ class PaperLocalizer:
         self._last_t_ns: int | None = None
 
     def process(self, frame: Frame) -> Fix:
-        """Image door. Raises: FrameError when the image is not of the camera's size."""
+        """Image door. Raises: FrameError when the image is not of the camera's size, or neither mono8 nor bgr8."""
         height, width = frame.image.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             wanted = f"{self.camera.width}x{self.camera.height}"
             raise FrameError("bad_frame", f"frame {frame.name} is {width}x{height}, the calibration {wanted}")
+        if frame.image.dtype != np.uint8 or frame.encoding.startswith("bayer"):
+            raise FrameError("bad_frame", f"frame {frame.name}: the paper's method takes mono8 and bgr8 only")
         detections = extract.lights(frame, self.config.extract)
         return self.process_detections(label_by_color(frame, detections, self.config.layers))
 

@@ -197,7 +197,9 @@ def _sequence(folder: Path, rows: list[Row], attitudes: _Attitudes) -> Iterator[
         encoding = (row.get("encoding") or "").strip()
         mosaic = encoding if encoding.startswith("bayer") else ""
         if encoding and encoding not in ENCODINGS:
-            raise FrameError("bad_frame", f"frame {row['frame']}: encoding {encoding[:40]!r} is none of {', '.join(ENCODINGS)}")
+            raise FrameError(
+                "bad_frame", f"frame {row['frame']}: encoding {encoding[:40]!r} is none of {', '.join(ENCODINGS)}"
+            )
         image = read_image(_inside(folder / "frames", row["file"]), mosaic)
         return Frame(row["frame"], t_ns, image, attitudes.at(t_ns), mosaic)
 
