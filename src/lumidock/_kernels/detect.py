@@ -339,8 +339,9 @@ def _level(
 ) -> float:
     """Grow the spot at the lowest share of its peak where it is round and alone.
 
-    If it is round nowhere, at the lowest where it is alone. Returns the share, 0 where the spot is never alone. A saturated core in one plane is swollen at half height by its
-    halo, which no colour tells apart: there the lowest share is left out.
+    If it is round nowhere, at the lowest where it is alone. Returns the share, 0 where the spot is never alone. A
+    saturated core in one plane is swollen at half height by its halo, which no colour tells apart: there the lowest
+    share is left out.
     """
     top = _peak_value(window[0], where, start)
     window[1][:] = 0
