@@ -23,6 +23,9 @@ class McapFile:
         self._file = path.open("wb")
         self._writer = Writer(self._file, chunk_size=1 << 20, compression=CompressionType.LZ4)
         self._writer.start("ros2", "lumidock")
+        for kind in set(ros2.TYPES.values()):
+            ros2.definition(kind)  # takes a moment at first use, before there are frames
+        self._writer.flush()
         self._camera, self._vehicle, self._light_ids = camera, vehicle, light_ids
         self._channels: dict[str, int] = {}
         self._flushed, self._mounted = time.monotonic(), vehicle is None
