@@ -314,7 +314,7 @@ def _seeds(text: str) -> tuple[int, int]:
 
 @app.command("warm", epilog=example("lumidock warm"))
 def _warm() -> None:
-    """Compile everything ahead, once on a machine, so that no run waits for it."""
+    """Compile ahead, so that no run waits for it."""
     from lumidock.warm import steps
 
     dock = load_station(shipped_or_path("station", DEFAULT_STATION))
