@@ -1,12 +1,14 @@
 """The default method's detector and its colour labels, on hand-made and rendered pictures."""
 
+import time
+
 import numpy as np
 import pytest
 from bench.shipped import shipped_camera, shipped_station
 
 from lumidock import detect, layers
 from lumidock.config import DetectConfig, LabelConfig
-from lumidock.datatypes import Attitude, Frame
+from lumidock.datatypes import MOSAICS, Attitude, Frame
 from lumidock.sim.scenario import load_scenario, trajectory
 from lumidock.sim.sequence import render_frame
 
@@ -234,3 +236,156 @@ def test_colour_without_light_says_nothing(rng):
     spot = type(dark).from_uv("f", 7, np.array([[30.0, 30.0], [0.0, 0.0]]))
     spot = type(dark)("f", 7, spot.uv, np.array([1.5, 1.5]), np.ones(2), np.ones(2), spot.p_rear)
     assert np.isnan(layers.label(frame, spot, LabelConfig()).p_rear[0])
+
+
+def as_format(image, kind):
+    """A linear grey picture as mono, BGR or a mosaic of 8 or 16 bits."""
+    deep = kind.endswith("16")
+    values = np.clip(np.rint(image * (257.0 if deep else 1.0)), 0, 65535 if deep else 255)
+    values = values.astype(np.uint16 if deep else np.uint8)
+    if kind.startswith("bgr"):
+        return Frame("f", 7, np.repeat(values[:, :, None], 3, axis=2))
+    return Frame("f", 7, values, encoding=kind)
+
+
+FORMATS = ("mono8", "mono16", "bgr8", "bgr16", *(f"{order}{bits}" for order in MOSAICS for bits in (8, 16)))
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_every_format_gives_the_same_lights(kind, rng):
+    image = canvas(rng, (400, 480))
+    places = np.array([[60.3, 70.6], [240.8, 200.1], [400.2, 320.7]])
+    for (u, v), sigma, peak in zip(places, (1.3, 2.2, 6.0), (120.0, 150.0, 100.0), strict=True):
+        add_spot(image, u, v, peak=peak, sigma=sigma)
+    spots = detect.lights(as_format(image, kind), CONFIG)
+    lamps = spots.uv[spots.p_light > 0.5]
+    distance = np.linalg.norm(lamps[:, None] - places[None], axis=2)
+    assert len(lamps) == 3
+    assert distance.min(axis=0).max() < 0.12
+
+
+@pytest.mark.parametrize("order", MOSAICS)
+def test_a_mosaic_tells_blue_from_white(order, rng):
+    image = canvas(rng, (240, 320))
+    letters = np.array(list(order.removeprefix("bayer_"))).reshape(2, 2)
+    share = np.tile(np.where(letters == "b", 1.0, 0.1), (120, 160))
+    white = np.tile(np.where(letters == "b", 0.5, 1.0), (120, 160))
+    for u, color in ((80.2, white), (240.7, share)):
+        spot = np.zeros_like(image)
+        add_spot(spot, u, 120.4, peak=120.0, sigma=2.0)
+        image += spot * color
+    frame = Frame("f", 7, to_picture(image), encoding=f"{order}8")
+    spots = layers.label(frame, detect.lights(frame, CONFIG), LabelConfig())
+    for u, rear in ((80.2, False), (240.7, True)):
+        k = np.argmin(np.linalg.norm(spots.uv - (u, 120.4), axis=1))
+        assert np.linalg.norm(spots.uv[k] - (u, 120.4)) < 0.2
+        assert (spots.p_rear[k] > 0.5) == rear
+
+
+def test_a_dim_blue_light_shows_before_a_brighter_green_background(rng):
+    image = np.stack([canvas(rng), canvas(rng, level=60.0), canvas(rng, level=10.0)], axis=2)
+    add_spot(image[:, :, 0], 150.3, 120.6, peak=12.0)
+    spots = found(image)
+    assert np.linalg.norm(spots.uv[spots.p_light > 0.5] - (150.3, 120.6), axis=1) == pytest.approx([0.0], abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "peak"), [(1.2, 12.0), (1.2, 60.0), (1.8, 30.0), (3.5, 60.0), (6.0, 120.0), (4.0, 900.0)]
+)
+def test_covariances_are_those_of_the_errors(sigma, peak, rng):
+    nees = []
+    for _ in range(6):
+        image, places = canvas(rng, (400, 400), noise=2.0), []
+        for k in range(9):
+            u, v = 70.0 + 130.0 * (k % 3) + rng.uniform(-0.5, 0.5), 70.0 + 130.0 * (k // 3) + rng.uniform(-0.5, 0.5)
+            add_spot(image, u, v, peak=peak, sigma=sigma)
+            places.append((u, v))
+        spots = found(image, DetectConfig(floor_px=1e-3, saturated_px=1e-3, signal_noise=1e-9))
+        for place in places:
+            k = np.argmin(np.linalg.norm(spots.uv - place, axis=1))
+            error = spots.uv[k] - place
+            nees.append(error @ np.linalg.solve(spots.cov_px2[k], error) / 2.0)
+    assert 0.25 < np.mean(nees) < 1.6
+    assert np.median(nees) < 1.2
+
+
+def test_what_may_be_two_lights_is_unsure_along_them(rng):
+    image = canvas(rng, (400, 400))
+    for shift in (-7.0, 7.0):
+        add_disc(image, 200.0 + shift, 200.0, 8.0, peak=400.0)
+    spots = found(image)
+    if len(spots) == 1:
+        sigma_u, sigma_v = np.sqrt(np.diag(spots.cov_px2[0]))
+        assert sigma_u > 2.0 > 4.0 * sigma_v
+
+
+def test_a_neighbour_halo_moves_no_centre(rng):
+    image = canvas(rng, (600, 800))
+    add_spot(image, 300.0, 300.0, peak=2000.0, sigma=5.0)
+    add_spot(image, 300.0, 300.0, peak=100.0, sigma=40.0)
+    add_spot(image, 360.4, 310.7, peak=60.0, sigma=1.6)
+    spots = found(image)
+    near = np.linalg.norm(spots.uv - (360.4, 310.7), axis=1)
+    assert near.min() < 0.15
+
+
+def drifting(rng, k, appeared):
+    """Spots that drift by two pixels a frame; one comes up at frame `appeared`."""
+    image = canvas(rng, (800, 1000))
+    places = [(200.3 + 2.0 * k, 200.6), (700.2 + 2.0 * k, 250.9), (400.8 + 2.0 * k, 600.1)]
+    for u, v in places:
+        add_spot(image, u, v)
+    if k >= appeared:
+        add_spot(image, 850.4, 720.2)
+    return Frame(str(k), k, to_picture(image)), np.array(places)
+
+
+def test_a_tracked_search_keeps_its_lights_and_sees_a_new_one_within_a_sweep(rng):
+    first, places = drifting(rng, 0, 5)
+    scan = detect.Scan(first, CONFIG)
+    detect.lights(first, CONFIG, scan)
+    since = 0
+    for k in range(1, 5 + detect.SWEEP + 4):
+        frame, places = drifting(rng, k, 5)
+        foretold = np.column_stack([places, np.full(3, 12.0)])
+        spots = detect.lights(frame, CONFIG, scan, foretold)
+        full = detect.lights(frame, CONFIG)
+        for place in places:
+            i, j = (np.argmin(np.linalg.norm(s.uv - place, axis=1)) for s in (spots, full))
+            np.testing.assert_allclose(spots.uv[i], full.uv[j], atol=0.02)
+        new = len(spots) and np.linalg.norm(spots.uv - (850.4, 720.2), axis=1).min() < 1.0
+        since = since + 1 if k >= 5 and not new else since
+        assert new or k < 5 + detect.SWEEP
+    assert since < detect.SWEEP
+
+
+def test_a_scan_made_for_another_camera_is_not_used(rng):
+    small, large = (
+        Frame("a", 0, to_picture(canvas(rng, (240, 320)))),
+        Frame("b", 1, to_picture(canvas(rng, (300, 320)))),
+    )
+    scan = detect.Scan(small, CONFIG)
+    assert scan.fits(small)
+    assert not scan.fits(large)
+    assert len(detect.lights(large, CONFIG, scan, np.zeros((1, 3)))) <= 1
+
+
+@pytest.mark.parametrize("blobs", [0, 10_000])
+def test_no_frame_takes_long(blobs, rng):
+    """Work is capped: in pure noise, and in more blobs than any dock has."""
+    image = canvas(rng, (2048, 2448), noise=30.0 if blobs == 0 else 2.0)
+    for u, v in rng.integers(8, 2040, (blobs, 2)):
+        image[v - 2 : v + 3, u - 2 : u + 3] += 100.0
+    crowded, easy = Frame("0", 0, to_picture(image)), Frame("1", 1, to_picture(canvas(rng, (2048, 2448))))
+    times = {}
+    for name, frame in (("crowded", crowded), ("easy", easy)):
+        scan = detect.Scan(frame, CONFIG)
+        detect.lights(frame, CONFIG, scan)
+        runs = []
+        for _ in range(5):
+            start = time.thread_time()
+            spots = detect.lights(frame, CONFIG, scan)
+            runs.append(time.thread_time() - start)
+        times[name] = np.median(runs)
+        assert len(spots) <= CONFIG.max_spots
+    assert times["crowded"] < 20.0 * times["easy"]

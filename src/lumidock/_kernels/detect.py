@@ -243,7 +243,7 @@ def _measure(
     n: int,
 ) -> int:
     """Measure the spot of one candidate tile into `spots[n]`: 1 if there is one, 0 if not, -1 if that was cheap."""
-    weight, where, start = np.zeros(4), np.zeros(5), np.zeros(2, np.int64)
+    weight, where, start = np.zeros(4), np.zeros(7), np.zeros(2, np.int64)
     radius, clipped = 0.0, scale * peak[:, i, j].max() >= q[CLIPPED]
     if clipped:
         radius = patch.weigh_clipped(image, planes, scale, v, u, _LEAST_STEP, q[MAX_RADIUS_PX], weight)
@@ -419,6 +419,7 @@ def _describe(
     spot[ELONGATION], spot[FILL] = patch.shape(sums)
     spot[SATURATED], spot[CUT] = sums[patch.CLIPPED] / area, sums[patch.EDGE] / area
     spread = _unresolved(sums, q, unit)
+    slope_u, slope_v = where[patch.SLOPE_U], where[patch.SLOPE_V]
     skew_u, skew_v = _skew(image, window, where, start, level + 0.5 * (top - level), q, unit)
     if unit > pitch:  # again, as finely as the room allows
         patch.cut(image, planes, scale, weight, v, u, 1.6 * radius + 3.0, patch.SIDE, window[0], where)
@@ -435,6 +436,7 @@ def _describe(
     center[0] = where[patch.LEFT] + unit * (start[0] + center[0]) + shift_u
     center[1] = where[patch.TOP] + unit * (start[1] + center[1]) + shift_v
     fitted = False
+    slope = (slope_u, slope_v) if planes < 4 else (0.0, 0.0)
     if radius <= q[SMALL_PX] * (1.6 if planes == 4 else 1.0) and sums[patch.EDGE] == 0.0:
         sample_noise = noise if planes < 4 else max(noise / np.sqrt((weight**2).sum()), q[MIN_NOISE])
         width = patch.fit(
@@ -442,6 +444,7 @@ def _describe(
             planes,
             scale,
             weight,
+            slope,
             center,
             max(radius / 1.18, 0.8),
             sample_noise,

@@ -23,7 +23,7 @@ _PRIOR_DOF = 20.0  # how much the expected noise counts beside the residuals of 
 # entries of `sums`, see `grow`; weights w are over the level
 N, X, Y, XX, XY, YY, W, WX, WY, CLIPPED, EDGE, OPEN = range(12)
 # the window's geometry, see `cut`
-LEFT, TOP, UNIT, COLUMNS, ROWS = range(5)
+LEFT, TOP, UNIT, COLUMNS, ROWS, SLOPE_U, SLOPE_V = range(7)
 Window = tuple[Array, NDArray[np.int16], NDArray[np.int32], Array]
 
 
@@ -207,6 +207,7 @@ def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tu
     low, high = ordered[quarter], ordered[count - 1 - quarter]
     fence = 1.5 * (high - low)
     gx, gy, opposite = 0.0, 0.0, 0
+    where[SLOPE_U], where[SLOPE_V] = 0.0, 0.0
     for k in range(_RING // 2):
         a, b = values[k], values[k + _RING // 2]
         if low - fence <= a <= high + fence and low - fence <= b <= high + fence:
@@ -223,6 +224,7 @@ def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tu
     level, spread = ordered[quarter : count - quarter].mean(), (ordered[count - 1 - quarter] - ordered[quarter]) / 1.35
     gx, gy = gx / radius, gy / radius
     if max(abs(gx), abs(gy)) * radius > 0.3 * spread:
+        where[SLOPE_U], where[SLOPE_V] = gx / where[UNIT], gy / where[UNIT]
         for i in range(rows):
             for j in range(columns):
                 patch[i, j] -= gx * (j - x) + gy * (i - y)
@@ -361,6 +363,7 @@ def fit(
     planes: int,
     scale: float,
     weight: Array,
+    slope: tuple[float, float],
     center: Array,
     width: float,
     noise: float,
@@ -391,7 +394,9 @@ def fit(
                     most = max(most, float(image[top + i, left + j, p]) if weight[p] > 0.0 else 0.0)
             else:
                 mixed = most = float(image[top + i, left + j, 0])
-            z[i, j] = scale * mixed if scale * most < clipped else np.nan
+            z[i, j] = scale * mixed - slope[0] * (left + j - u0) - slope[1] * (top + i - v0)
+            if scale * most >= clipped:
+                z[i, j] = np.nan
     u, v, s = center[0], center[1], width
     amplitude, ground = np.zeros(4), np.zeros(4)
     dx, dy = 1.0, 1.0
