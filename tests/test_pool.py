@@ -4,10 +4,13 @@ import csv
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lumidock.camera import load_camera
 from lumidock.config import Config
+from lumidock.datatypes import Frame
+from lumidock.localizer import Localizer
 from lumidock.paper import PaperLocalizer
 from lumidock.run import Setup, run
 from lumidock.station import load_station
@@ -30,3 +33,28 @@ def test_pool_run_finishes_with_a_row_for_every_frame(tmp_path):
     assert [row["frame"] for row in rows] == [str(number) for number in range(240)]
     assert all(row["valid"] == "0" for row in rows[:40])  # no dock in view
     assert json.loads((tmp_path / "run" / "run.json").read_text())["counts"]["finished"]
+
+
+@pytest.mark.skipif(not POOL.exists(), reason="the real pool frames are not on this machine")
+def test_lights_beside_a_white_funnel_are_found_and_named():
+    """Nothing is locked where no dock is in view; where eight lights are, the lock holds and fits the picture."""
+    station, camera = load_station(POOL / "station.yaml"), load_camera(POOL / "camera.yaml")
+    localizer = Localizer(station, camera)
+    locked, errors = [], []
+    for number, frame in enumerate(open_source(POOL).items()):
+        if number >= 150:
+            break
+        if not (number < 41 or number >= 80):
+            continue
+        assert isinstance(frame, Frame)
+        fix = localizer.process(frame)
+        holds = fix.status != "none" and fix.guide is not None
+        assert number >= 41 or not holds
+        locked += [holds] if number >= 84 else []
+        if holds and fix.status != "coasting":
+            T_cam_dock = localizer.beliefs[0].T_cam_dock
+            uv = camera.project(station.p_dock @ T_cam_dock[:3, :3].T + T_cam_dock[:3, 3])
+            named = fix.match.light >= 0
+            errors += np.linalg.norm(fix.match.detections.uv[named] - uv[fix.match.light[named]], axis=1).tolist()
+    assert np.mean(locked) > 0.85
+    assert np.median(errors) < 0.8
