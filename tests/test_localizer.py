@@ -147,6 +147,13 @@ def test_cold_poses_are_as_good_as_the_light_allows(z_m, layers):
         assert np.sqrt(np.mean(np.square(laterals))) < 0.006
 
 
+def test_four_lights_that_leave_two_poses_promise_neither():
+    """Off the axis the two tilts that four lights leave are not opposite, and both fit to a fraction of a pixel."""
+    localizer = Localizer(STATION, CAMERA, cold=True)
+    for frame in frames_of("missing-3", seed=100):
+        require_true(localizer.process_detections(frame.detections), frame.T_dock_cam)
+
+
 def test_layers_that_come_and_go_make_no_jump():
     """The error moves by less than three sigma where the lights of the rear layer appear or vanish."""
     frames, localizer = frames_of("nominal", "path.start_z_m=13", "path.end_z_m=2", seed=31), Localizer(STATION, CAMERA)

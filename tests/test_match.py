@@ -168,7 +168,7 @@ def test_a_measured_attitude_names_a_rolled_camera(roll_deg, rng):
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_fewer_than_three_spots_are_too_few(n, rng):
     found = acquire(seen_from(pose(HEAD_ON, [0, 0, 8.0]), np.arange(n), rng))
-    assert (found.candidates, found.flipped, found.reason) == ((), None, "too_few")
+    assert (found.candidates, found.others, found.reason) == ((), (), "too_few")
     assert not answer(found)
     assert (verify.names_of(found, CONFIG.match, M) == -1).all()
 

@@ -206,7 +206,7 @@ class Localizer:
         """Believe an answer, its flip and, with history, what contradicts it and is not yet out of the question."""
         head = found.candidates[0]
         rivals = [c for c in found.candidates[1:] if verify.contradict(c.name, head.name)]
-        namings = [head, *([found.flipped] if found.flipped else []), *([] if self.cold else rivals[:_MAX_RIVALS])]
+        namings = [head, *found.others, *([] if self.cold else rivals[:_MAX_RIVALS])]
         begun = [self._start(naming, detections, seen) for naming in namings]
         if begun[0] is None or not verify.innovation_holds(begun[0], self.config.track):
             return False
@@ -219,7 +219,7 @@ class Localizer:
 
         A naming that this frame gives again starts anew from its pose now, with the weight that it has gathered.
         """
-        new = [*found.candidates, *([found.flipped] if found.flipped else [])][: self.config.track.beliefs]
+        new = [*found.candidates, *found.others][: self.config.track.beliefs]
         begun = [self._renew(naming, new, followed, detections, seen) for naming in new]
         others = [b for b in followed if not any((b.name == naming.name).all() for naming in new)]
         self.beliefs = self._likeliest([*others, *(belief for belief in begun if belief is not None)])

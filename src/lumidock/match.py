@@ -80,11 +80,11 @@ class Acquisition:
     """The best hypothesis first, without its doubtful names, and all that fit, with them.
 
     `margin` is the log odds of its names against all others.
-    `flipped` is the other pose of the best names where the plane's flip leaves two. `reason` says why it is no answer.
+    `others` are the other poses that the best names fit, where a plane leaves two. `reason` says why it is no answer.
     """
 
     candidates: tuple[Hypothesis, ...]
-    flipped: Hypothesis | None
+    others: tuple[Hypothesis, ...]
     margin: float
     reason: str = ""
 
@@ -317,13 +317,12 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
     ask = _question(plan, found, camera, expected, config)
     listed = _search(ask, plan.direct, 3, 4, 3)
     if not listed.whole:
-        return Acquisition((), None, 0.0, "too_many")
+        return Acquisition((), (), 0.0, "too_many")
     if not len(listed.scores):
-        return Acquisition((), None, 0.0, "too_few" if len(found.uv) < 3 else "ambiguous")
+        return Acquisition((), (), 0.0, "too_few" if len(found.uv) < 3 else "ambiguous")
     top = _polish(ask, listed.names[0], listed.Rs[0], listed.ts[0], float(listed.scores[0]))
-    R2, t2 = np.empty((3, 3)), np.empty(3)
-    other = other_pose(top.name, plan.direct, ask.seen, ask.expected, top.R, top.t, R2, t2)
-    best = float(np.logaddexp(top.score, other))
+    others = [pose for pose in (_other_pose(ask, top, level=level) for level in (False, True)) if pose is not None]
+    best = max([top.score, *(score for _, score in others)])  # they share most of their mass
     kept = _kept(top, best, listed, _crowding(top.name, found, plan, config), plan, config)
     conflicting = listed.scores[conflicts(kept, listed.names)]
     mirror = _mirror_evidence(ask, top)
@@ -333,11 +332,18 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
         for name, s, R, t in zip(listed.names, listed.scores, listed.Rs, listed.ts, strict=True)
         if s > best - config.keep and (name != kept).any()
     ]
-    flipped = Hypothesis(kept, _pose(R2, t2), other) if other > top.score - config.keep else None
     head = Hypothesis(kept, _pose(top.R, top.t), top.score)
     direct = float(np.logaddexp.reduce([_NONE, *listed.scores[(listed.names != top.name).any(axis=1)]]))
     reason = "mirror" if mirror > max(best - config.margin, direct) else "ambiguous"
-    return Acquisition((head, *rest), flipped, best - against, reason)
+    same = tuple(Hypothesis(kept, T_cam_dock, score) for T_cam_dock, score in others)
+    return Acquisition((head, *rest), same, best - against, reason)
+
+
+def _other_pose(ask: _Question, top: _Polished, *, level: bool) -> tuple[Array, float] | None:
+    """Another pose of the best names, if there is one nearly as good, and its log evidence."""
+    R2, t2 = np.empty((3, 3)), np.empty(3)
+    score = other_pose(top.name, ask.plan.direct, ask.seen, ask.expected, level, top.R, top.t, R2, t2)
+    return (_pose(R2, t2), float(score)) if score > top.score - ask.config.keep else None
 
 
 def _likeliest(found: Spots, most: int) -> Indices | None:
@@ -354,8 +360,7 @@ def _renamed(found: Acquisition, detections: Indices) -> Acquisition:
     def of_all(part: Hypothesis) -> Hypothesis:
         return replace(part, name=np.where(part.name >= 0, detections[part.name], -1))
 
-    flipped = of_all(found.flipped) if found.flipped else None
-    return replace(found, candidates=tuple(map(of_all, found.candidates)), flipped=flipped)
+    return replace(found, candidates=tuple(map(of_all, found.candidates)), others=tuple(map(of_all, found.others)))
 
 
 def _kept(top: _Polished, best: float, listed: _Found, crowding: float, plan: Plan, config: MatchConfig) -> Indices:

@@ -27,9 +27,21 @@ from lumidock.datatypes import Array, Indices
 
 @njit(cache=True, error_model="numpy")
 def other_pose(
-    name: Indices, lights: Lights, seen: Seen, expected: Expected, R: Array, t: Array, R2: Array, t2: Array
+    name: Indices,
+    lights: Lights,
+    seen: Seen,
+    expected: Expected,
+    level: bool,
+    R: Array,
+    t: Array,
+    R2: Array,
+    t2: Array,
 ) -> float:
-    """The flipped pose `R2`, `t2` of the same names and its log evidence; hugely negative where there is but one."""
+    """Another pose `R2`, `t2` that fits the same names, and its log evidence; hugely negative where there is but one.
+
+    Found from the flipped pose, or, with `level`, from the expected attitude: lights off the axis leave two solutions
+    whose tilts are not opposite.
+    """
     H, L = np.empty((6, 6)), np.empty((6, 6))
     ps, n = np.empty((len(name), 3)), 0
     for c in range(len(name)):
@@ -37,9 +49,37 @@ def other_pose(
             ps[n] = lights.p[c]
             n += 1
     R2[:], t2[:] = R, t
-    flip(ps, n, R2, t2)
+    if level:
+        _levelled(ps, n, expected.Rp, R2, t2)
+    else:
+        flip(ps, n, R2, t2)
     e = evidence(name, lights, seen, expected, R2, t2, 20, H, L)
     return -HUGE if turn(R, R2) < SAME_TURN else e
+
+
+@njit(cache=True, error_model="numpy")
+def _levelled(p: Array, n: int, Rp: Array, R: Array, t: Array) -> None:
+    """Turn a pose, in place, to the expected attitude with its own roll, about the centre of lights `p` (n, 3)."""
+    sine, cosine = 0.0, 0.0
+    for k in range(3):
+        sine += R[1, k] * Rp[k, 0] - R[0, k] * Rp[k, 1]
+        cosine += R[0, k] * Rp[k, 0] + R[1, k] * Rp[k, 1]
+    norm = max(math.hypot(sine, cosine), 1e-12)
+    s, c = sine / norm, cosine / norm
+    centre, q = np.zeros(3), t.copy()
+    for m in range(n):
+        centre += p[m] / n
+    for i in range(3):
+        for k in range(3):
+            q[i] += R[i, k] * centre[k]
+    for k in range(3):
+        R[0, k] = c * Rp[k, 0] - s * Rp[k, 1]
+        R[1, k] = s * Rp[k, 0] + c * Rp[k, 1]
+        R[2, k] = Rp[k, 2]
+    for i in range(3):
+        t[i] = q[i]
+        for k in range(3):
+            t[i] -= R[i, k] * centre[k]
 
 
 @njit(cache=True, error_model="numpy")
