@@ -24,7 +24,7 @@ from lumidock.sim.scenario import shipped_scenarios
 
 LUMIDOCK = str(Path(sys.executable).with_name("lumidock"))
 PLAIN = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
-COMMANDS = ("run", "sim", "eval", "demo")
+COMMANDS = ("run", "sim", "eval", "demo", "warm")
 PAPER = ("--method", "paper")
 SET = [word for setting in SETTINGS for word in ("--set", setting)]
 
