@@ -7,7 +7,7 @@ from bench.shipped import shipped_camera, shipped_station
 from lumidock.datatypes import Detections, Fix, Match
 from lumidock.overlay import around_lights, draw, whole
 from lumidock.pose import project_lights
-from lumidock.report import contact_sheet, plot_trajectory
+from lumidock.report.stills import contact_sheet, plot_trajectory
 
 STATION, CAMERA = shipped_station(), shipped_camera()
 

@@ -34,7 +34,7 @@ def true_poses(truth: Path) -> dict[str, Array]:
     Raises: InputError, one line.
     """
     path = truth / "truth.csv" if truth.is_dir() else truth
-    return {row["frame"]: _pose(path, row) for row in _rows(path, ("frame", *_POSE))}
+    return {row["frame"]: _pose(path, row) for row in read_rows(path, ("frame", *_POSE))}
 
 
 def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
@@ -44,7 +44,7 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
     """
     folder = truth if truth.is_dir() else truth.parent
     true, path = true_poses(truth), run_folder / "fixes.csv"
-    fixes = _rows(path, ("frame", "t_ns", "valid", "reason", *_POSE))
+    fixes = read_rows(path, ("frame", "t_ns", "valid", "reason", *_POSE))
     if fixes and not any(row["frame"] in true for row in fixes):
         raise InputError(f"{truth}: knows none of the run's frames")
     poses = {row["frame"]: _pose(path, row) for row in fixes if row["valid"] == "1"}
@@ -135,7 +135,8 @@ def _shares(counts: dict[str, Any]) -> dict[str, float | None]:
     return {word: counts[word] / counts["frames"] if counts["frames"] else None for word in ("valid", "guide")}
 
 
-def _rows(path: Path, columns: tuple[str, ...]) -> list[Row]:
+def read_rows(path: Path, columns: tuple[str, ...]) -> list[Row]:
+    """Rows of a CSV file that has these columns. Raises: InputError, one line."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, restval="")
@@ -210,7 +211,7 @@ def _layers(run_folder: Path, true: dict[str, Array]) -> dict[str, Any]:
     """First and last true z of each layer's fixes, and the offset between the layers where both gave one."""
     poses: dict[str, dict[str, Array]] = {}
     path, station_file = run_folder / "layers.csv", run_folder / "station.yaml"
-    for row in _rows(path, ("frame", "layer", *_POSE)):
+    for row in read_rows(path, ("frame", "layer", *_POSE)):
         if row["frame"] in true:
             poses.setdefault(row["layer"], {})[row["frame"]] = _pose(path, row)
     result: dict[str, Any] = {}
@@ -244,10 +245,10 @@ def _labels(run_folder: Path, truth_folder: Path, true: dict[str, Array]) -> dic
     truth_path, path, pixel = truth_folder / "lights_truth.csv", run_folder / "lights.csv", ("u_px", "v_px")
     lights = {
         (row["frame"], row["light"]): _numbers(truth_path, row, pixel)
-        for row in _rows(truth_path, ("frame", "light", *pixel, "visible"))
+        for row in read_rows(truth_path, ("frame", "light", *pixel, "visible"))
         if row["visible"] == "1"
     }
-    named = [row for row in _rows(path, ("frame", "light", *pixel)) if row["light"] and row["frame"] in true]
+    named = [row for row in read_rows(path, ("frame", "light", *pixel)) if row["light"] and row["frame"] in true]
     wrong = 0
     for row in named:
         at, seen = lights.get((row["frame"], row["light"])), _numbers(path, row, pixel)
@@ -264,7 +265,7 @@ def _residual_rms_px(run_folder: Path, poses: dict[str, Array]) -> float | None:
     path, pixel = run_folder / "lights.csv", ("u_px", "v_px")
     index = {light: i for i, light in enumerate(station.ids)}
     named: dict[str, list[Row]] = {}
-    for row in _rows(path, ("frame", "light", *pixel)):
+    for row in read_rows(path, ("frame", "light", *pixel)):
         if row["light"] in index and row["frame"] in poses:
             named.setdefault(row["frame"], []).append(row)
     squares = [np.empty(0)]

@@ -15,7 +15,7 @@ import cv2
 import typer
 
 from lumidock.camera import load_camera, save_camera
-from lumidock.cli import calibration, exporting, inspection, machine, serving, stations
+from lumidock.cli import calibration, exporting, inspection, machine, reporting, serving, stations
 from lumidock.cli.evaluation import print_evaluation
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
@@ -57,7 +57,15 @@ from lumidock.streams.sources import Item, open_source
 _MAX_SEED = 10**9
 
 
-_COMMANDS = (inspection, exporting, serving, calibration, stations, machine)  # importing them adds their commands
+_COMMANDS = (
+    inspection,
+    exporting,
+    reporting,
+    serving,
+    calibration,
+    stations,
+    machine,
+)  # importing them adds their commands
 
 
 def main() -> None:
@@ -334,7 +342,7 @@ def _demo(
     from lumidock.demo import Album, summary_lines
     from lumidock.localizer import Localizer
     from lumidock.metrics import evaluate, true_poses
-    from lumidock.report import contact_sheet, plot_trajectory
+    from lumidock.report.stills import contact_sheet, plot_trajectory
     from lumidock.run import Setup
     from lumidock.run import run as run_source
     from lumidock.sim.scenario import load_scenario

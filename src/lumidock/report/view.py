@@ -1,0 +1,205 @@
+"""A run folder as arrays for its report, with the truth and the pictures where they are at hand."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lumidock import trust
+from lumidock.camera import Camera, load_camera
+from lumidock.datatypes import Array, Fix
+from lumidock.errors import InputError
+from lumidock.metrics import evaluate, read_rows, true_poses
+from lumidock.station import Station, load_station
+from lumidock.streams.replay import read_fixes
+from lumidock.streams.runfolder import sha256
+from lumidock.streams.sources import Source, open_source
+from lumidock.trust import GuideClaims, PoseClaims
+
+KINDS = ("lateral", "axial", "angle")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunView:
+    """A run of N frames.
+
+    `t_s` (N,) since the first stamp, NaN without one; `position` (N, 3) m, `levels` and `limits` (N, 3) lateral m,
+    axial m and angle rad, NaN without a valid pose; `guide` (N, 3) bearings rad and range m, `guide_levels` and
+    `guide_limits` (N, 2) bearing rad and range m, NaN without a guide. Against the truth, NaN where there is none:
+    `true_position` (N, 3), `errors` (N, 3) and `guide_errors` (N, 2); `visible` (N, M) says which lights could be seen,
+    None where that is not known. `latency_ms` (N,).
+    """
+
+    name: str
+    folder: Path
+    station: Station
+    camera: Camera
+    described: dict[str, Any]
+    fixes: list[Fix]
+    t_s: Array
+    latency_ms: Array
+    position: Array
+    levels: Array
+    limits: Array
+    guide: Array
+    guide_levels: Array
+    guide_limits: Array
+    true_position: Array
+    errors: Array
+    guide_errors: Array
+    visible: np.ndarray | None
+    source: Source | None
+    evaluation: dict[str, Any] | None
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether any frame's true pose is known."""
+        return bool(np.isfinite(self.true_position).any())
+
+    @property
+    def valid(self) -> np.ndarray:
+        """Which frames (N,) have a pose."""
+        return np.array([fix.valid for fix in self.fixes], bool)
+
+    @property
+    def guided(self) -> np.ndarray:
+        """Which frames (N,) have a guide."""
+        return np.array([fix.guide is not None for fix in self.fixes], bool)
+
+
+def load_run(folder: Path, source: Path | None = None) -> RunView:
+    """Read a run folder; pictures and truth from `source`, or from the sequence found beside or in the run.
+
+    Raises: InputError, one line, for a folder that is no run, or a source that it was not made from.
+    """
+    described = _described(folder)
+    station, camera = load_station(folder / "station.yaml"), load_camera(folder / "camera.yaml")
+    rows = list(read_fixes(folder, station.ids))
+    if not rows:
+        raise InputError(f"{folder}: a run without frames")
+    fixes = [fix for fix, _, _ in rows]
+    opened = _source_of(folder, described, source)
+    truth = _truth_of(opened)
+    start = next((t for _, t, _ in rows if t is not None), 0)
+    guide, guide_levels, guide_limits, guide_errors = _guide_columns(fixes, truth)
+    return RunView(
+        "/".join(folder.resolve().parts[-2:]),
+        folder,
+        station,
+        camera,
+        described,
+        fixes,
+        np.array([np.nan if t is None else (t - start) * 1e-9 for _, t, _ in rows]),
+        np.array([np.nan if us is None else us * 1e-3 for _, _, us in rows]),
+        *_pose_columns(fixes),
+        guide,
+        guide_levels,
+        guide_limits,
+        _true_positions(fixes, truth),
+        _pose_errors(fixes, truth),
+        guide_errors,
+        _visible(fixes, station, opened),
+        opened,
+        evaluate(folder, opened.path) if truth and opened is not None else None,
+    )
+
+
+def _described(folder: Path) -> dict[str, Any]:
+    path = folder / "run.json"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: not the description of a run")
+    return content
+
+
+def _source_of(folder: Path, described: dict[str, Any], given: Path | None) -> Source | None:
+    """The run's source, by its hashes: the one given, or the one in or beside the run folder."""
+    if given is not None:
+        opened = open_source(given, None)
+        if not _is_source(opened, described):
+            raise InputError(f"{given}: not what {folder} was made from")
+        return opened
+    name = Path(str(described.get("source", {}).get("name", ""))).name or "sequence"
+    for place in (folder / name, folder.parent / name):
+        if (place / "timestamps.csv").is_file():
+            opened = open_source(place)
+            if _is_source(opened, described):
+                return opened
+    return None
+
+
+def _is_source(source: Source, described: dict[str, Any]) -> bool:
+    """Whether the files that identify a source are those of the run."""
+    known = described.get("inputs_sha256", {})
+    return all(known.get(path.name, "") == sha256(path) for path in source.inputs)
+
+
+def _truth_of(source: Source | None) -> dict[str, Array]:
+    """True poses by frame name; none without a truth.csv."""
+    if source is None or not (source.path / "truth.csv").is_file():
+        return {}
+    return true_poses(source.path)
+
+
+def _pose_columns(fixes: list[Fix]) -> tuple[Array, Array, Array]:
+    """Positions, protection levels and alert limits of the frames, each (N, 3)."""
+    position, levels = np.full((len(fixes), 3), np.nan), np.full((len(fixes), 3), np.nan)
+    for k, fix in enumerate(fixes):
+        if fix.T_dock_cam is not None:
+            position[k] = fix.T_dock_cam[:3, 3]
+        if fix.protection is not None:
+            levels[k] = fix.protection.lateral_m, fix.protection.axial_m, fix.protection.angle_rad
+    n = len(fixes)
+    claims = PoseClaims(position[:, 2], np.zeros((n, 6)), levels, np.zeros((n, 6, 6)), [""] * n)
+    return position, levels, np.where(np.isfinite(position[:, 2:]), claims.limits(), np.nan)
+
+
+def _guide_columns(fixes: list[Fix], truth: dict[str, Array]) -> tuple[Array, Array, Array, Array]:
+    """Guides (N, 3), their levels and limits (N, 2), and their errors (N, 2)."""
+    n = len(fixes)
+    guide, levels, true = np.full((n, 3), np.nan), np.full((n, 2), np.nan), np.full((n, 3), np.nan)
+    for k, fix in enumerate(fixes):
+        if fix.guide is not None:
+            guide[k] = fix.guide.bearing_x_rad, fix.guide.bearing_y_rad, fix.guide.range_m
+            levels[k] = fix.guide.pl_bearing_rad, fix.guide.pl_range_m
+        if fix.frame in truth:
+            true[k] = trust.true_guide(truth[fix.frame])
+    claims = GuideClaims(guide, true, levels)
+    known = np.isfinite(guide[:, 2:])
+    return guide, levels, np.where(known, claims.limits(), np.nan), np.where(known, claims.sizes(), np.nan)
+
+
+def _true_positions(fixes: list[Fix], truth: dict[str, Array]) -> Array:
+    unknown = np.full(3, np.nan)
+    return np.array([truth[fix.frame][:3, 3] if fix.frame in truth else unknown for fix in fixes]).reshape(-1, 3)
+
+
+def _pose_errors(fixes: list[Fix], truth: dict[str, Array]) -> Array:
+    """Errors of the poses (N, 3): lateral m, axial m, angle rad."""
+    n = len(fixes)
+    errors = np.full((n, 6), np.nan)
+    for k, fix in enumerate(fixes):
+        if fix.T_dock_cam is not None and fix.frame in truth:
+            errors[k] = trust.pose_error(fix.T_dock_cam, truth[fix.frame])
+    unknown = np.full((n, 3), np.nan)
+    return PoseClaims(unknown[:, 0], errors, unknown, np.full((n, 6, 6), np.nan), [""] * n).sizes()
+
+
+def _visible(fixes: list[Fix], station: Station, source: Source | None) -> np.ndarray | None:
+    """Which of the M lights could be seen in each frame (N, M), by the truth of a simulated source."""
+    path = source.path / "lights_truth.csv" if source is not None else Path()
+    if not path.is_file():
+        return None
+    frame, light = {fix.frame: k for k, fix in enumerate(fixes)}, {name: i for i, name in enumerate(station.ids)}
+    visible = np.zeros((len(fixes), len(station.ids)), bool)
+    for row in read_rows(path, ("frame", "light", "visible")):
+        if row["visible"] == "1" and row["frame"] in frame and row["light"] in light:
+            visible[frame[row["frame"]], light[row["light"]]] = True
+    return visible
