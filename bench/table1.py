@@ -7,88 +7,24 @@ no spurious one carries any.
 from __future__ import annotations
 
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from multiprocessing import get_context
 
-import numpy as np
-
 from bench.shipped import shipped_camera, shipped_station
-from lumidock.config import PaperConfig
-from lumidock.paper import PaperLocalizer
-from lumidock.paper.consistency import consistent
-from lumidock.paper.layer import LayerLocalizer
-from lumidock.sim.scenario import Scenario, load_scenario
-from lumidock.sim.spots import SpotFrame, spot_frames
+from lumidock.reproduce import trials
+from lumidock.reproduce.paper import TABLE_1
+from lumidock.reproduce.trials import Counts
 
 TRIALS = 30
 FIRST_SEED = 20_000
-PAPER = {
-    (3, 0): (90.3, 100.0),
-    (2, 0): (98.6, 100.0),
-    (1, 0): (100.0, 100.0),
-    (0, 1): (99.6, 100.0),
-    (0, 2): (99.6, 99.9),
-}
+PAPER = TABLE_1
 CONDITIONS = (*PAPER, (1, 1))
-CLEAN_FRAMES = 4  # before the faults begin, in the rows with history
-
-
-@dataclass(slots=True)
-class Counts:
-    """Frames; those right by the swarm alone, let pass wrongly by the filter, and right and wrong in the end."""
-
-    frames: int = 0
-    swarm_right: int = 0
-    filter_passes_wrong: int = 0
-    right: int = 0
-    wrong: int = 0
-
-    def __add__(self, other: Counts) -> Counts:
-        return Counts(*(a + b for a, b in zip(asdict(self).values(), asdict(other).values(), strict=True)))
-
-
-def trials_scenario(missing: int, spurious: int) -> Scenario:
-    """Section 4.1 with the rear layer out of sight."""
-    settings = (f"faults.missing={missing}", f"faults.spurious={spurious}", "spots.rear_range_m=0.01")
-    return load_scenario("trials", settings)
 
 
 def trial(missing: int, spurious: int, seed: int, *, clean_start: bool = False) -> Counts:
-    """One run toward the dock: the swarm alone without history, and the whole method with it.
-
-    With `clean_start` the faults begin after a few frames without, which are not counted.
-    """
-    station, camera = shipped_station(), shipped_camera()
-    front = station.lights_of("front")
-    alone, whole = LayerLocalizer(station, "front", camera, PaperConfig()), PaperLocalizer(station, camera)
-    counts = Counts()
-    clean = spot_frames(trials_scenario(0, 0), station, camera, seed)
-    faulty = spot_frames(trials_scenario(missing, spurious), station, camera, seed)
-    in_view = [pair for pair in zip(clean, faulty, strict=True) if pair[1].in_view[front].all()]
-    warming = CLEAN_FRAMES if clean_start else 0
-    for before, _ in in_view[:warming]:
-        whole.process_detections(before.detections)
-    for _, frame in in_view[warming:]:
-        _count(counts, frame, alone, whole)
-    return counts
-
-
-def _count(counts: Counts, frame: SpotFrame, alone: LayerLocalizer, whole: PaperLocalizer) -> None:
-    registration = alone.register(frame.detections.uv)
-    assert registration is not None
-    swarm_right = np.array_equal(registration.light, frame.light)
-    named = registration.light >= 0
-    xy = alone.plane(frame.detections.uv)[named]
-    passes = consistent(alone.p_dock[registration.light[named], :2], xy, alone.config.consistency)
-    fix = whole.process_detections(frame.detections)
-    counts.frames += 1
-    counts.swarm_right += swarm_right
-    counts.filter_passes_wrong += passes and not swarm_right
-    if fix.match is not None and fix.valid:
-        right = np.array_equal(fix.match.light, frame.light)
-        counts.right += right
-        counts.wrong += not right
+    """One run toward the shipped dock."""
+    return trials.trial(shipped_station(), shipped_camera(), missing, spurious, seed, clean_start=clean_start)
 
 
 def condition(

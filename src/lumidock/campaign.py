@@ -144,7 +144,7 @@ def plan(
     """Cut scenarios x methods x the seeds from `seeds[0]` to before `seeds[1]` into shards. Raises: InputError."""
     station, camera = load_station(station_file), load_camera(camera_file)
     inputs = {path.name: _digest(path.read_bytes()) for path in (station_file, camera_file)}
-    shared = {"lumidock": f"{version('lumidock')}+{_source_digest()}", "inputs": inputs, "cold": cold, "bound": bound}
+    shared = {"lumidock": f"{version('lumidock')}+{source_digest()}", "inputs": inputs, "cold": cold, "bound": bound}
     shards = []
     for scenario in dict.fromkeys(scenario.model_dump_json() for scenario in scenarios):
         parsed = Scenario.model_validate_json(scenario)
@@ -177,7 +177,7 @@ def _digest(content: bytes) -> str:
 
 
 @cache
-def _source_digest() -> str:
+def source_digest() -> str:
     """Of all source of the package: counts are not mixed between versions of it."""
     digest = hashlib.sha256()
     package = Path(__file__).parent
@@ -193,7 +193,7 @@ def prepare(campaign: Campaign, out: Path, *, force: bool = False) -> None:
     Raises: InputError.
     """
     described = out / "campaign.json"
-    before = _read_json(described)
+    before = read_json(described)
     if before != campaign.identity:
         if out.exists() and not out.is_dir():
             raise InputError(f"{out}: is a file")
@@ -205,7 +205,7 @@ def prepare(campaign: Campaign, out: Path, *, force: bool = False) -> None:
     for path in (out / "shards").glob("*.json*"):
         if path.name not in wanted:
             path.unlink()
-    _write(described, json.dumps(campaign.identity, indent=1))
+    write_whole(described, json.dumps(campaign.identity, indent=1))
 
 
 def run_campaign(
@@ -226,7 +226,7 @@ def run_campaign(
     progress(total - len(todo), total)
     workers = os.cpu_count() or 1 if workers is None else workers
     for shard, result in _results(list(todo.values()), workers, cluster):
-        _write(out / "shards" / shard.file, json.dumps(result))
+        write_whole(out / "shards" / shard.file, json.dumps(result))
         del todo[shard.file]
         frames, seconds = frames + result["tally"]["counts"]["frames"], seconds + result["seconds"]
         progress(total - len(todo), total)
@@ -240,7 +240,7 @@ def _results(shards: list[Shard], workers: int, cluster: str | None) -> Iterator
         return
     left = {shard.file: shard for shard in shards}
     for _ in range(_MAX_POOLS):
-        with _pool(workers, cluster) as pool:
+        with worker_pool(workers, cluster) as pool:
             for shard, result in _pooled(pool, list(left.values())):
                 del left[shard.file]
                 yield shard, result
@@ -273,7 +273,7 @@ def _worker_died(error: Exception) -> bool:
 
 
 @contextmanager
-def _pool(workers: int, cluster: str | None) -> Iterator[Executor]:
+def worker_pool(workers: int, cluster: str | None) -> Iterator[Executor]:
     """Worker processes here, or those of a dask cluster."""
     if cluster is not None:
         with _dask_client(cluster) as client:
@@ -313,11 +313,12 @@ def _end_with_parent() -> None:
 
 def _read_shard(out: Path, shard: Shard) -> dict[str, Any] | None:
     """The counts of a shard that was finished before."""
-    content = _read_json(out / "shards" / shard.file)
+    content = read_json(out / "shards" / shard.file)
     return content if content and content.get("key") == shard.key else None
 
 
-def _read_json(path: Path) -> dict[str, Any] | None:
+def read_json(path: Path) -> dict[str, Any] | None:
+    """The mapping in a JSON file; None where there is none."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -325,7 +326,7 @@ def _read_json(path: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else None
 
 
-def _write(path: Path, text: str) -> None:
+def write_whole(path: Path, text: str) -> None:
     """Write a file so that it is there whole or not at all."""
     partial = path.with_name(f"{path.name}.tmp")
     partial.write_text(text, encoding="utf-8")
@@ -344,6 +345,6 @@ def tabulate(campaign: Campaign, out: Path) -> dict[str, Any]:
     names = {shard.scenario.model_dump_json(): shard.scenario.name for shard in campaign.shards}
     rows = [{"scenario": names[key], "method": method} | row_of(tally) for (key, method), tally in tallies.items()]
     table = {name: campaign.identity[name] for name in ("lumidock", "inputs", "cold", "seeds")} | {"rows": rows}
-    _write(out / "table.json", json.dumps(table, indent=1))
-    _write(out / "table.md", markdown(table))
+    write_whole(out / "table.json", json.dumps(table, indent=1))
+    write_whole(out / "table.md", markdown(table))
     return table

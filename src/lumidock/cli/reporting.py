@@ -1,13 +1,25 @@
-"""`lumidock report`."""
+"""`lumidock report` and `lumidock reproduce`."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from lumidock.cli.shared import Force, app, example, progress_bar
+from lumidock.cli.shared import (
+    DEFAULT_CAMERA,
+    DEFAULT_STATION,
+    AsJson,
+    CameraOption,
+    Force,
+    StationOption,
+    app,
+    example,
+    progress_bar,
+    shipped_or_path,
+)
 from lumidock.errors import InputError
 
 
@@ -40,3 +52,36 @@ def _report(
         text = report(runs, sources or (), progress=progress)
     page.write(out, text)
     print(f"{out}: {len(text.encode()) / 1e6:.1f} MB")
+
+
+@app.command(
+    "reproduce",
+    epilog=example(
+        "lumidock reproduce --quick --out REPRODUCTION",
+        "lumidock reproduce --full --out REPRODUCTION",
+    ),
+)
+def _reproduce(
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder to write; the same command goes on where it was.")
+    ],
+    full: Annotated[bool, typer.Option("--full/--quick", help="Hours, or minutes (default).")] = False,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Processes; without it one for each core.")
+    ] = None,
+    station: StationOption = None,
+    camera: CameraOption = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Repeat every experiment of the paper by both methods, and what it left open, as one page."""
+    from lumidock.reproduce import FULL, QUICK, reproduce
+
+    files = shipped_or_path("station", station or DEFAULT_STATION), shipped_or_path("camera", camera or DEFAULT_CAMERA)
+    with progress_bar("reproduce, s of work") as progress:
+        results = reproduce(FULL if full else QUICK, *files, out, force=force, workers=workers, progress=progress)
+    if as_json:
+        print(json.dumps(results, indent=1))
+        return
+    print((out / "tables.md").read_text(encoding="utf-8"))
+    print(f"look at {out / 'report.html'}")

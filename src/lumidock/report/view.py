@@ -114,7 +114,8 @@ def _described(folder: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
-    if not isinstance(content, dict):
+    parts = ("source", "inputs_sha256", "config", "counts")
+    if not isinstance(content, dict) or not all(isinstance(content.get(part, {}), dict) for part in parts):
         raise InputError(f"{path}: not the description of a run")
     return content
 
