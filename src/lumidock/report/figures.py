@@ -369,6 +369,7 @@ def _draw_latency(figure: Figure, views: Sequence[RunView]) -> None:
         axes.axvline(float(np.percentile(ms, 95)), color=color, ls="--", lw=1)
     axes.set(xscale="log", xlabel="ms a frame", ylabel="frames")
     axes.xaxis.set_major_formatter(lambda value, _at: f"{value:g}")
+    axes.xaxis.set_minor_formatter(lambda _value, _at: "")
     if len(views) > 1:
         axes.legend()
 

@@ -100,14 +100,22 @@ def _picture(view: RunView, fix: Fix, image: Image, title: str) -> Picture:
     predicted = _predicted(view, fix)
     rejected = _rejections(fix, view.station, predicted)
     marks = [*_crosses(view.station, predicted, part), *_rings(fix, view.station, part, rejected)]
-    notes = [f"{number}: {why}" for number, why in enumerate(rejected.values(), start=1)]
-    if len(notes) > _MOST_NOTES:
-        notes = [*notes[:_MOST_NOTES], f"and {len(notes) - _MOST_NOTES} more turned down"]
+    notes = _notes(list(rejected.values()))
     inside = [m for m in marks if -20 < m.x < size[0] + 20 and -20 < m.y < size[1] + 20]
     shown = "all of the picture" if part.width == image.shape[1] else f"{part.width} of {image.shape[1]} px across"
     shown += f", contrast times {gain:.1f}" if gain > 1.0 else ""
     encoded = base64.b64encode(jpeg.tobytes()).decode()
     return Picture(title, f"{_sentence(fix, view)} ({shown})", encoded, *size, inside, notes)
+
+
+def _notes(why: list[str]) -> list[str]:
+    """A line for each reason, with the numbers of the rings that it holds for."""
+    numbers: dict[str, list[str]] = {}
+    for number, reason in enumerate(why, start=1):
+        numbers.setdefault(reason, []).append(str(number))
+    notes = [f"{', '.join(of)}: {reason}" for reason, of in numbers.items()]
+    more = len(notes) - _MOST_NOTES
+    return notes if more <= 0 else [*notes[:_MOST_NOTES], f"and {more} more reasons"]
 
 
 def _brightened(image: Image) -> tuple[Image, float]:

@@ -41,8 +41,8 @@ class Grid:
 
 QUICK = Grid(
     name="quick",
-    trials=8,
-    trials_a_job=4,
+    trials=6,
+    trials_a_job=3,
     draws=100,
     dockings=1,
     docking_interval_s=0.15,
@@ -50,7 +50,7 @@ QUICK = Grid(
     waters=tuple(WATERS),
     exposures_ms=(2.0, 6.0),
     envelope_seeds=1,
-    envelope_interval_s=1.0,
+    envelope_interval_s=1.5,
     daylight=(0.0, 10.0),
     point_seeds=2,
     rendered_seeds=0,

@@ -55,8 +55,8 @@ def backtracking(result: dict[str, Any]) -> Plot:
         "backtracking",
         caption,
         lambda f, narrow: _draw_backtracking(f, narrow, result),
-        height_in=4.2,
-        narrow_height_in=7.6,
+        height_in=2.9,
+        narrow_height_in=5.0,
     )
 
 
