@@ -89,7 +89,8 @@ _HAZARD_TEXT = (
 def _summary(results: Results) -> Section:
     rows = [*_table_1_claims(results), *_docking_claims(results)]
     table = Table(
-        "The paper's own figures and those found here; ✓ is as good or better. Times are of this machine, the paper's of a Jetson.",
+        "The paper's own figures and those found here; ✓: as good or better. Times are of this machine, "
+        "the paper's of a Jetson.",
         ["figure", "paper", "its method here", "lumidock"],
         [[name, paper, _with_verdict(theirs), _with_verdict(ours)] for name, paper, theirs, ours in rows],
     )
