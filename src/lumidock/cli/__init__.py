@@ -15,8 +15,7 @@ import cv2
 import typer
 
 from lumidock.camera import load_camera, save_camera
-from lumidock.cli import calibration, exporting, inspection, machine, reporting, serving, stations
-from lumidock.cli.evaluation import print_evaluation
+from lumidock.cli import calibration, evaluation, exporting, inspection, machine, reporting, serving, stations
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
@@ -58,6 +57,7 @@ _MAX_SEED = 10**9
 
 
 _COMMANDS = (
+    evaluation,
     inspection,
     exporting,
     reporting,
@@ -237,22 +237,6 @@ def _sim(
         with progress_bar("sim") as progress:
             frames = write_rendered(loaded, dock, lens, seed, out, video=video, workers=workers, progress=progress)
     print(f"{frames} frames written to {out}")
-
-
-@app.command("eval", epilog=example("lumidock eval RUN SEQ"))
-def _eval(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
-    truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="Simulated sequence folder, or a truth.csv.")],
-    as_json: AsJson = False,
-) -> None:
-    """Compare a run with the truth."""
-    from lumidock.metrics import evaluate
-
-    result = evaluate(run, truth)
-    if as_json:
-        print(json.dumps(result, indent=2))
-    else:
-        print_evaluation(result)
 
 
 @app.command("campaign", epilog=example("lumidock campaign nominal --seeds 0:100 --out CAMPAIGN"))

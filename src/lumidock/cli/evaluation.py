@@ -1,8 +1,66 @@
-"""An evaluation as text."""
+"""`lumidock eval`, and an evaluation as text."""
 
 from __future__ import annotations
 
-from typing import Any
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lumidock.cli.shared import AsJson, Force, app, example
+from lumidock.errors import InputError
+
+
+@app.command(
+    "eval",
+    epilog=example("lumidock eval RUN SEQ", "lumidock eval RUNS", "lumidock eval RUNS --out runs.parquet"),
+)
+def _eval(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or a folder with runs in it.")],
+    truth: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="TRUTH", help="Simulated sequence folder, or a truth.csv; or looked for beside each run."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Also write a row a run as .parquet or .json.")
+    ] = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Compare a run, or all in a folder, with the truth."""
+    from lumidock.metrics import evaluate
+    from lumidock.runs import evaluate_all, write_table
+
+    if out is not None and out.exists() and not force:
+        raise InputError(f"{out}: exists; give --force to replace it")
+    one = (run / "fixes.csv").exists()
+    if one and truth is not None and out is None:  # needs no run.json
+        result = evaluate(run, truth)
+    else:
+        rows = evaluate_all(run, truth)
+        result = rows[0]
+        if out is not None:
+            write_table(rows, out)
+    if as_json:
+        print(json.dumps(result if one else rows, indent=2))
+    elif one:
+        print_evaluation(result)
+    else:
+        print_table(rows)
+
+
+def print_table(rows: list[dict[str, Any]]) -> None:
+    """Evaluations, a line a run."""
+    width = max(len(row["run"]) for row in rows)
+    print(f"{'run':{width}} {'method':>9} {'frames':>7} {'valid':>7} {'guide':>7} {'hazards':>8}", end="   ")
+    print("lateral m       axial m         angle deg   (median / 95 %)")
+    for row in rows:
+        hazards = sum(row["hazardous"][word]["any"] for word in ("valid", "guide"))
+        counts = f"{row['frames']:7d} {row['valid']:7d} {row['guide']:7d} {hazards:8d}"
+        print(f"{row['run']:{width}} {row['method'] or '?':>9} {counts}   {_errors(row['error'])}")
 
 
 def print_evaluation(result: dict[str, Any]) -> None:
@@ -33,9 +91,13 @@ def _print_ranges(result: dict[str, Any]) -> None:
     print("lateral m       axial m         angle deg   (median / 95 %)")
     for row in [*result["by_true_z"], {"z_m": None, **result, **result["error"]}]:
         where = "all" if row["z_m"] is None else f"{row['z_m'][0]:g}..{row['z_m'][1]:g}"
-        errors = (row.get(name) for name in ("lateral_m", "axial_m", "angle_deg"))
-        cells = "  ".join(f"{e['median']:6.3f} /{e['p95']:7.3f}" if e else f"{'-':>15}" for e in errors)
-        print(f"{where:>12} {row['frames']:7d} {row['valid']:6d} {row['guide']:6d}   {cells}")
+        print(f"{where:>12} {row['frames']:7d} {row['valid']:6d} {row['guide']:6d}   {_errors(row)}")
+
+
+def _errors(row: dict[str, Any]) -> str:
+    """Median / 95 % of each error, dashes where there is none."""
+    errors = (row.get(name) for name in ("lateral_m", "axial_m", "angle_deg"))
+    return "  ".join(f"{e['median']:6.3f} /{e['p95']:7.3f}" if e else f"{'-':>15}" for e in errors)
 
 
 def _print_trust(result: dict[str, Any]) -> None:

@@ -32,7 +32,10 @@ from lumidock.errors import InputError
     ),
 )
 def _report(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders; several are compared.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN...", help="Run folders, or folders with runs in them; several are compared."),
+    ],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The page, one HTML file.")],
     sources: Annotated[
         list[Path] | None,

@@ -11,6 +11,7 @@ from lumidock.page import Section
 from lumidock.report import figures, tables
 from lumidock.report.moments import pictures
 from lumidock.report.view import RunView, load_run
+from lumidock.runs import find_runs
 
 _MOST_RUNS = 12
 
@@ -23,9 +24,11 @@ def report(
 ) -> str:
     """The page of one run or several, as HTML that needs nothing else.
 
-    `sources` holds one for all runs, or one for each, for pictures and truth; without it they are looked for beside the
-    runs. Raises: InputError, one line, for a folder that is no run, or a source that a run was not made from.
+    A folder with runs in it stands for all of them. `sources` holds one for all runs, or one for each, for pictures and
+    truth; without it they are looked for beside the runs. Raises: InputError, one line, for a folder that is no run, or
+    a source that a run was not made from.
     """
+    runs = [run for folder in runs for run in find_runs(folder)]
     if len(runs) > _MOST_RUNS:
         raise InputError(f"{len(runs)} runs: at most {_MOST_RUNS} fit on a page that a person likes to read")
     if len(sources) not in (0, 1, len(runs)):

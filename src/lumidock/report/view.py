@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lumidock import trust
+from lumidock import runs, trust
 from lumidock.camera import Camera, load_camera
 from lumidock.datatypes import Array, Fix
 from lumidock.errors import InputError
 from lumidock.metrics import evaluate, read_rows, true_poses
 from lumidock.station import Station, load_station
 from lumidock.streams.replay import read_fixes
-from lumidock.streams.runfolder import sha256
-from lumidock.streams.sources import Source, open_source
+from lumidock.streams.sources import Source
 from lumidock.trust import GuideClaims, PoseClaims
 
 KINDS = ("lateral", "axial", "angle")
@@ -76,13 +74,13 @@ def load_run(folder: Path, source: Path | None = None) -> RunView:
 
     Raises: InputError, one line, for a folder that is no run, or a source that it was not made from.
     """
-    described = _described(folder)
+    description = runs.described(folder)
     station, camera = load_station(folder / "station.yaml"), load_camera(folder / "camera.yaml")
     rows = list(read_fixes(folder, station.ids))
     if not rows:
         raise InputError(f"{folder}: a run without frames")
     fixes = [fix for fix, _, _ in rows]
-    opened = _source_of(folder, described, source)
+    opened = runs.source_of(folder, description, source)
     truth = _truth_of(opened)
     start = next((t for _, t, _ in rows if t is not None), 0)
     guide, guide_levels, guide_limits, guide_errors = _guide_columns(fixes, truth)
@@ -91,7 +89,7 @@ def load_run(folder: Path, source: Path | None = None) -> RunView:
         folder,
         station,
         camera,
-        described,
+        description,
         fixes,
         np.array([np.nan if t is None else (t - start) * 1e-9 for _, t, _ in rows]),
         np.array([np.nan if us is None else us * 1e-3 for _, _, us in rows]),
@@ -106,40 +104,6 @@ def load_run(folder: Path, source: Path | None = None) -> RunView:
         opened,
         evaluate(folder, opened.path) if truth and opened is not None else None,
     )
-
-
-def _described(folder: Path) -> dict[str, Any]:
-    path = folder / "run.json"
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
-    parts = ("source", "inputs_sha256", "config", "counts")
-    if not isinstance(content, dict) or not all(isinstance(content.get(part, {}), dict) for part in parts):
-        raise InputError(f"{path}: not the description of a run")
-    return content
-
-
-def _source_of(folder: Path, described: dict[str, Any], given: Path | None) -> Source | None:
-    """The run's source, by its hashes: the one given, or the one in or beside the run folder."""
-    if given is not None:
-        opened = open_source(given, None)
-        if not _is_source(opened, described):
-            raise InputError(f"{given}: not what {folder} was made from")
-        return opened
-    name = Path(str(described.get("source", {}).get("name", ""))).name or "sequence"
-    for place in (folder / name, folder.parent / name):
-        if (place / "timestamps.csv").is_file():
-            opened = open_source(place)
-            if _is_source(opened, described):
-                return opened
-    return None
-
-
-def _is_source(source: Source, described: dict[str, Any]) -> bool:
-    """Whether the files that identify a source are those of the run."""
-    known = described.get("inputs_sha256", {})
-    return all(known.get(path.name, "") == sha256(path) for path in source.inputs)
 
 
 def _truth_of(source: Source | None) -> dict[str, Array]:
