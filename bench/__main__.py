@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from bench import contact_sheet, detection, doors, images, rendering, speed, table1, visibility
+from bench import contact_sheet, detection, doors, images, rendering, reproduced, speed, table1, visibility
 
 BENCHES = {
     "doors": doors,
@@ -21,6 +21,7 @@ BENCHES = {
     "detection": detection,
     "visibility": visibility,
     "rendering": rendering,
+    "reproduced": reproduced,
     "contact-sheet": contact_sheet,
 }
 

@@ -75,6 +75,7 @@ def _style(font_pt: float, salt: str) -> Any:  # noqa: ANN401  # matplotlib name
         "legend.frameon": False,
         "legend.fontsize": font_pt - 1,
         "path.simplify": True,
+        "figure.constrained_layout.h_pad": 0.09,  # browsers have taller letters
     }
 
 

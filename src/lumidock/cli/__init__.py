@@ -323,9 +323,11 @@ def _demo(
     force: Force = False,
 ) -> None:
     """Simulate a docking, run it, and leave files and pictures."""
+    from lumidock import page
     from lumidock.demo import Album, summary_lines
     from lumidock.localizer import Localizer
     from lumidock.metrics import evaluate, true_poses
+    from lumidock.report import report
     from lumidock.report.stills import contact_sheet, plot_trajectory
     from lumidock.run import Setup
     from lumidock.run import run as run_source
@@ -366,5 +368,7 @@ def _demo(
     result = evaluate(run_folder, sequence)
     plot_trajectory(album.fixes, true_poses(sequence), dock, out / "trajectory.png")
     contact_sheet(album.sheet(), out / "stages.jpg")
+    page.write(out / "report.html", report([run_folder], [sequence]))
     print("\n".join(summary_lines(result, summary.as_dict())))
-    print(f"look at     {out / 'trajectory.png'}, {out / 'stages.jpg'}, {video}, {run_folder / 'fixes.csv'}")
+    shown = (out / "report.html", out / "trajectory.png", out / "stages.jpg", video, run_folder / "fixes.csv")
+    print(f"look at     {', '.join(map(str, shown))}")

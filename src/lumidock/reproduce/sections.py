@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lumidock.page import Section, Table, Tile
+from lumidock.page import Section, Table, Tile, markdown
 from lumidock.report import figures
 from lumidock.report.moments import pictures
 from lumidock.report.view import load_run
@@ -29,6 +29,9 @@ from lumidock.reproduce.trials import Counts
 from lumidock.reproduce.work import search_sides
 
 Results = Mapping[str, Any]
+_Claim = tuple[
+    str, str, tuple[str, bool], tuple[str, bool]
+]  # figure, paper, and its method's and ours with whether met
 _SHOWN_PICTURES = 6
 _END_M = 0.25  # a frame is so near to the docking plane when it is the last of a coarse run
 
@@ -86,7 +89,7 @@ _HAZARD_TEXT = (
 # The paper's figures, all at once
 
 
-def _summary(results: Results) -> Section:
+def _summary_table(results: Results) -> tuple[Table, list[_Claim]]:
     rows = [*_table_1_claims(results), *_docking_claims(results)]
     table = Table(
         "The paper's own figures and those found here; ✓: as good or better. Times are of this machine, "
@@ -94,15 +97,22 @@ def _summary(results: Results) -> Section:
         ["figure", "paper", "its method here", "lumidock"],
         [[name, paper, _with_verdict(theirs), _with_verdict(ours)] for name, paper, theirs, ours in rows],
     )
+    return table, rows
+
+
+def summary_table(results: Results) -> str:
+    """The paper's figures and those found here as Markdown, without a caption."""
+    return markdown(_summary_table(results)[0]).partition("\n\n")[2].strip()
+
+
+def _summary(results: Results) -> Section:
+    table, rows = _summary_table(results)
     met = [sum(bool(pair[k][1]) for pair in ((row[2], row[3]) for row in rows)) for k in (0, 1)]
     tiles = [
         Tile(f"{met[1]} of {len(rows)}", "figures of the paper met or beaten by lumidock", _good(met[1] == len(rows))),
         Tile(f"{met[0]} of {len(rows)}", "met by the paper's method here", _good(met[0] == len(rows))),
     ]
     return Section("The paper's figures", tiles=tiles, items=[table])
-
-
-_Claim = tuple[str, str, tuple[str, bool], tuple[str, bool]]
 
 
 def _with_verdict(cell: tuple[str, bool]) -> str:

@@ -1,0 +1,15 @@
+"""The paper's figures by `lumidock reproduce --quick`, in bench-out/reproduction."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bench.shipped import CAMERA_FILE, STATION_FILE
+from lumidock.reproduce import QUICK, reproduce
+from lumidock.reproduce.sections import summary_table
+
+
+def main() -> tuple[dict[str, object], list[str]]:
+    """The first table of the page, without its caption."""
+    results = reproduce(QUICK, STATION_FILE, CAMERA_FILE, Path("bench-out") / "reproduction")
+    return results, summary_table(results).splitlines()
