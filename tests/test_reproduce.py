@@ -28,7 +28,8 @@ TINY = replace(
     waters=("III",),
     exposures_ms=(2.0,),
     envelope_interval_s=6.0,
-    daylight=(10.0,),
+    daylight_w_m2=(600.0,),
+    shipped=(),
     point_seeds=1,
 )
 
@@ -93,7 +94,7 @@ def test_jobs_have_names_of_their_own_and_cover_every_water(grid, tmp_path):
     assert not [name for name in names if set(name) & set('/\\:*?"<>| ')]
     for water in grid.waters:
         for exposure in grid.exposures_ms:
-            assert any(n.startswith(f"envelope-water-{water.replace(' ', '-')}-{exposure:g}-") for n in names)
+            assert any(n.startswith(f"envelope-water-{water}-{exposure:g}-") for n in names)
 
 
 def test_folder_of_something_else_is_left_alone(tmp_path):

@@ -4,18 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# absorption and scattering 1/m at 455, 530, 610 nm.
-# Source: Williamson & Hollins 2022; Solonenko & Mobley 2015.
-WATERS = {
-    "pure sea": ((0.0119, 0.0429, 0.269), (0.0043, 0.0022, 0.0012)),
-    "IB": ((0.040, 0.052, 0.273), (0.134, 0.124, 0.117)),
-    "II": ((0.061, 0.061, 0.277), (0.194, 0.180, 0.168)),
-    "III": ((0.107, 0.081, 0.287), (0.308, 0.291, 0.277)),
-    "1C": ((0.141, 0.095, 0.294), (0.454, 0.432, 0.413)),
-    "3C": ((0.191, 0.128, 0.314), (0.684, 0.652, 0.624)),
-    "5C": ((0.295, 0.169, 0.333), (1.27, 1.21, 1.16)),
-    "7C": ((0.511, 0.225, 0.327), (3.24, 2.50, 1.97)),
-}
+WATERS = ("pure-sea", "IB", "II", "III", "1C", "3C", "5C", "7C", "pool-clear", "pool-murky")  # of the simulator
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +22,10 @@ class Grid:
     exposures_ms: tuple[float, ...]
     envelope_seeds: int
     envelope_interval_s: float
-    daylight: tuple[float, ...]  # times the default
+    daylight_w_m2: tuple[float, ...]  # below the surface; noon under a clear sky 100, the default 60
+    shipped: tuple[str, ...]  # scenarios that are rendered beside the paper's
     point_seeds: int  # of every shipped docking at point level
-    rendered_seeds: int  # of every shipped docking that is rendered
+    rendered_seeds: int  # of every shipped docking; 0: one of those in `shipped`
     first_seed: int = 41_000
 
 
@@ -47,11 +37,12 @@ QUICK = Grid(
     dockings=1,
     docking_interval_s=0.15,
     search_interval_s=1.0,
-    waters=tuple(WATERS),
+    waters=WATERS,
     exposures_ms=(2.0, 6.0),
     envelope_seeds=1,
-    envelope_interval_s=1.5,
-    daylight=(0.0, 10.0),
+    envelope_interval_s=1.0,
+    daylight_w_m2=(0.0, 600.0),
+    shipped=("vehicle", "swapped-colors"),
     point_seeds=2,
     rendered_seeds=0,
 )
@@ -63,11 +54,12 @@ FULL = Grid(
     dockings=3,
     docking_interval_s=0.15,
     search_interval_s=0.5,
-    waters=tuple(WATERS),
+    waters=WATERS,
     exposures_ms=(1.0, 2.0, 4.0, 8.0),
     envelope_seeds=2,
     envelope_interval_s=0.15,
-    daylight=(0.0, 3.0, 10.0, 30.0),
+    daylight_w_m2=(0.0, 100.0, 600.0, 2000.0),
+    shipped=(),
     point_seeds=20,
     rendered_seeds=2,
 )

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from lumidock.reproduce import work
-from lumidock.reproduce.grid import WATERS, Grid
+from lumidock.reproduce.grid import Grid
 from lumidock.reproduce.jobs import Job
 from lumidock.reproduce.paper import DISTANCES_M, TABLE_1
-from lumidock.sim.scenario import Scenario, Water, load_scenario, shipped_scenarios
+from lumidock.sim.scenario import load_scenario, shipped_scenarios
 
 ROWS = (*((*faults, False) for faults in TABLE_1), (1, 1, False), (1, 1, True), (3, 2, True))
 FAULTS_AT_DISTANCE = ((1, 0), (2, 0), (3, 0), (0, 1), (0, 2))
@@ -21,9 +21,8 @@ COLD = {
     "only the mirror image in view": "mirror-only",
 }
 SWARM_ITERATIONS = [0, 1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120]
-_FRAME_S = {"rendered": 0.5, "paper": 0.05}  # about what a frame costs
+_FRAME_S = {"rendered": 0.2, "paper": 0.08}  # about what a frame costs
 _APPROACH_M = 33.0
-SHOWN_VEHICLE = "vehicle"  # a scenario with another vehicle's lamps
 
 
 def jobs_of(grid: Grid, dock: work.Dock, out: Path) -> list[Job]:
@@ -84,18 +83,16 @@ def _rendered(grid: Grid, dock: work.Dock, out: Path) -> list[Job]:
 
 
 def _shipped(grid: Grid, dock: work.Dock, out: Path) -> list[Job]:
-    """Every shipped scenario with a path, rendered; at least one with another vehicle's lights where there is one."""
-    found = [(name, load_scenario(name)) for name in shipped_scenarios()]
-    names = [name for name, scenario in found if scenario.path.kind != "draws"] if grid.rendered_seeds else []
-    if not names and SHOWN_VEHICLE in dict(found):
-        names = [SHOWN_VEHICLE]
-    interval = () if grid.rendered_seeds else (f"path.frame_interval_s={grid.envelope_interval_s}",)
+    """Shipped scenarios with a path, rendered: all of them, or on a coarser path those that the grid names."""
+    names, interval = list(grid.shipped), [f"path.frame_interval_s={grid.envelope_interval_s}"]
+    if grid.rendered_seeds:
+        names, interval = [n for n in shipped_scenarios() if load_scenario(n).path.kind != "draws"], []
     return [
         Job(
             f"shipped-{name}-{seed}",
-            _cost(_APPROACH_M / 0.15),
+            _cost(_APPROACH_M / (0.15 if grid.rendered_seeds else grid.envelope_interval_s)),
             work.docking,
-            (dock, name, list(interval), grid.first_seed + seed, str(out / "runs" / f"{name}-{seed}"), False),
+            (dock, name, interval, grid.first_seed + seed, str(out / "runs" / f"{name}-{seed}"), False),
         )
         for name in names
         for seed in range(max(grid.rendered_seeds, 1))
@@ -117,13 +114,12 @@ def _cold(grid: Grid, dock: work.Dock) -> list[Job]:
 def _envelope(grid: Grid, dock: work.Dock) -> list[Job]:
     """Waters x exposures, then light from above, then other salt and heat where the simulator knows of them."""
     rows = [
-        (f"water-{name}-{exposure:g}", [*_water(name), f"sensor.exposure_ms={exposure}"])
+        (f"water-{name}-{exposure:g}", [f"water.kind={name}", f"sensor.exposure_ms={exposure}"])
         for name in grid.waters
         for exposure in grid.exposures_ms
     ]
-    rows += [(f"daylight-{times:g}", [*_water("III"), _daylight(times)]) for times in grid.daylight]
-    if "salinity_psu" in Water.model_fields:
-        rows.append(("salt", [*_water("III"), "water.salinity_psu=5", "water.temperature_c=5"]))
+    rows += [(f"daylight-{light:g}", [f"daylight.surface_w_m2={light}"]) for light in grid.daylight_w_m2]
+    rows.append(("salt-5-5", ["water.salinity_psu=5", "water.temperature_c=5"]))
     interval = f"path.frame_interval_s={grid.envelope_interval_s}"
     cost = _cost(_APPROACH_M / grid.envelope_interval_s)
     return [
@@ -131,19 +127,6 @@ def _envelope(grid: Grid, dock: work.Dock) -> list[Job]:
         for name, settings in rows
         for seed in range(grid.first_seed, grid.first_seed + grid.envelope_seeds)
     ]
-
-
-def _water(name: str) -> list[str]:
-    absorption, scattering = WATERS[name]
-    return [f"water.absorption={list(absorption)}", f"water.scattering={list(scattering)}"]
-
-
-def _daylight(times: float) -> str:
-    """So many times the default light from above, in the words of the simulator that is there."""
-    if "ambient_e" in Water.model_fields:
-        default = Scenario().water.ambient_e
-        return f"water.ambient_e={[times * value for value in default]}"
-    return f"daylight.surface_w_m2={times * 60.0}"
 
 
 def _point_level(grid: Grid, dock: work.Dock) -> list[Job]:

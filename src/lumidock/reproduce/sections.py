@@ -339,7 +339,7 @@ def _envelope(grid: Grid, results: Results) -> list[Any]:
     ]
     caption = (
         f"First and last true z in m, from 30 to -3 m at 1 m/s with a frame every {grid.envelope_interval_s:g} s; "
-        "coarser frames make a filter's life harder. Light from above in type III at 2 ms, times the default."
+        "coarser frames make a filter's life harder. Light from above (60 W/m2 elsewhere) and salt in type III at 2 ms."
     )
     return [plots.envelope(rows, caption), Table(caption, head, rows)]
 
@@ -348,8 +348,8 @@ def _envelope_name(name: str) -> str:
     kind, _, rest = name.partition("-")
     if kind == "water":
         water, _, exposure = rest.rpartition("-")
-        return f"{water.replace('-', ' ')}, {exposure} ms"
-    return f"light from above times {rest}" if kind == "daylight" else "III, 5 psu, 5 deg C"
+        return f"{water}, {exposure} ms"
+    return f"light from above {rest} W/m2" if kind == "daylight" else "III, 5 psu, 5 deg C"
 
 
 def _hazards(results: Results) -> list[Any]:
