@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from lumidock.errors import InputError
 from lumidock.localizer import Localizer
 from lumidock.page import Table, markdown, render
 from lumidock.report import report
-from lumidock.report.figures import _spans
+from lumidock.report.figures import _spans, _thinned
 from lumidock.report.view import load_run
 from lumidock.run import Setup, run
 from lumidock.sim.scenario import load_scenario
@@ -149,6 +150,26 @@ def test_pictures_say_what_was_named_and_why_the_rest_was_not(seen_text):
     assert text.count("data:image/jpeg") >= 4
     assert "from the nearest light" in text or "hardly a lamp" in text
     assert len(text.encode()) < 5e6
+
+
+def test_page_of_many_runs_stays_small(docking):
+    text = report([docking] * 12)
+    assert len(text.encode()) < 5e6
+    page = Reader(text)
+    assert [v for v in page.values("figure", "id") if v.endswith("-trajectory")] == [
+        f"r{k}-trajectory" for k in range(1, 13)
+    ]
+
+
+def test_long_runs_keep_what_must_be_seen(docking):
+    view = load_run(docking)
+    n = len(view.fixes)
+    errors = view.errors.copy()
+    errors[n - 2] = 2.0 * np.nan_to_num(view.levels[n - 2], nan=1.0)  # the one frame that broke its promise
+    broken = replace(view, errors=errors)
+    kept = _thinned(broken, 5)
+    assert kept[n - 2]
+    assert kept.sum() <= 6
 
 
 def test_without_its_source_a_run_has_neither_truth_nor_pictures(docking, tmp_path):

@@ -22,6 +22,7 @@ COLORS = {
 }
 _WIDTH_IN = {"wide": 10.0, "narrow": 4.6}
 _FONT_PT = {"wide": 9.5, "narrow": 10.5}
+_DECIMALS = re.compile(r"(\.\d\d)\d+")  # of points; more cannot be seen
 Draw = Callable[["Figure", bool], None]
 
 
@@ -88,6 +89,7 @@ def _for_page(svg: str, prefix: str, layout: str, caption: str) -> str:
     for name, color in COLORS.items():
         svg = svg.replace(color, f"var(--{name})")
     svg = re.sub(r"font: ([^;\"]*?)(\d[\d.]*px) [^;\"]*", r"font-size: \2", svg)
+    svg = re.sub(r' (?:d|x|y)="[^"]*"', lambda found: _DECIMALS.sub(r"\1", found[0]), svg)
     box = re.search(r'viewBox="[^"]*"', svg)
     head = f'<svg class="plot {layout}" {box[0] if box else ""} role="img" aria-label="{escaped(caption)}">'
     return head + svg[svg.index(">") + 1 :]

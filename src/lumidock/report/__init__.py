@@ -13,7 +13,8 @@ from lumidock.report.moments import pictures
 from lumidock.report.view import RunView, load_run
 from lumidock.runs import find_runs
 
-_MOST_RUNS = 12
+_MOST_RUNS, _MOST_IN_FULL = 12, 3
+_POINTS_IN_BRIEF = 150
 
 
 def report(
@@ -38,7 +39,10 @@ def report(
     sections = [_together(views)] if len(views) > 1 else []
     for k, view in enumerate(views):
         progress(k, len(views))
-        sections += sections_of(view, f"r{k + 1}", alone=len(views) == 1)
+        if len(views) > _MOST_IN_FULL:
+            sections.append(_in_brief(view, f"r{k + 1}"))
+        else:
+            sections += sections_of(view, f"r{k + 1}", alone=len(views) == 1)
     progress(len(views), len(views))
     return page.render(_title(views), _lead(views), sections)
 
@@ -65,6 +69,13 @@ def sections_of(view: RunView, prefix: str, *, alone: bool, most_pictures: int |
     made = [found[name] for name in ("latency",) if name in found]
     sections.append(Section(f"Time and settings{of}", items=[*made, *tables.versions(view)]))
     return sections
+
+
+def _in_brief(view: RunView, prefix: str) -> Section:
+    """One run of many: its numbers, its way, and why it had no pose; the rest is on a page of its own."""
+    way = [figures.trajectory(view, prefix, _POINTS_IN_BRIEF)] if view.valid.any() else []
+    why = [table for table in (tables.reasons(view), tables.handover(view)) if table is not None]
+    return Section(view.name, tiles=tables.tiles(view), items=[*way, *why])
 
 
 def _together(views: Sequence[RunView]) -> Section:

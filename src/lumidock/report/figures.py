@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STAGES = ("search", "front", "transition", "rear")
-_MOST_POINTS = 1500  # of a series; of longer runs every k-th frame is drawn, and all that is over its level
+_MOST_POINTS = 700  # of a series; of longer runs every k-th frame is drawn, and all that is over its level
 _ELLIPSES = 14
 _SHOWN = {"lateral": ("lateral, m", 1.0), "axial": ("axial, m", 1.0), "angle": ("angle, deg", 180.0 / np.pi)}
 _RUN_COLORS = ("rear", "front", "transition", "accent", "bad", "search")
@@ -37,11 +37,11 @@ def of_run(view: RunView, prefix: str) -> list[Plot]:
     return figures
 
 
-def _thinned(view: RunView) -> np.ndarray:
+def _thinned(view: RunView, most: int = _MOST_POINTS) -> np.ndarray:
     """Frames (N,) to draw: all, or every k-th of a long run and all whose error is over its level."""
     n = len(view.fixes)
     keep = np.zeros(n, bool)
-    keep[:: max(1, -(-n // _MOST_POINTS))] = True
+    keep[:: max(1, -(-n // most))] = True
     with np.errstate(invalid="ignore"):
         return keep | (view.errors > view.levels).any(axis=1)
 
@@ -53,8 +53,8 @@ def _stage_of(view: RunView) -> np.ndarray:
 # Where the vehicle was
 
 
-def trajectory(view: RunView, prefix: str) -> Plot:
-    """Top and side view with two-sigma ellipses, protection levels and alert limits."""
+def trajectory(view: RunView, prefix: str, most_points: int = _MOST_POINTS) -> Plot:
+    """Top and side view with two-sigma ellipses, protection levels and alert limits, of so many frames at most."""
     truth = " The thin line is the truth." if view.has_truth else ""
     caption = (
         "Where the camera was in the dock frame: from above (x to the right) and from the side (y up), over the "
@@ -68,14 +68,14 @@ def trajectory(view: RunView, prefix: str) -> Plot:
     return plot(
         f"{prefix}-trajectory",
         caption,
-        lambda f, narrow: _draw_trajectory(f, narrow, view),
+        lambda f, narrow: _draw_trajectory(f, narrow, view, most_points),
         height_in=6.0,
         narrow_height_in=6.4,
     )
 
 
-def _draw_trajectory(figure: Figure, narrow: bool, view: RunView) -> None:
-    keep = _thinned(view)
+def _draw_trajectory(figure: Figure, narrow: bool, view: RunView, most_points: int) -> None:
+    keep = _thinned(view, most_points)
     panels = figure.subplots(2, 1, sharex=True)
     for axes, column, label in zip(panels, (0, 1), ("x, m", "y, m"), strict=True):
         _draw_bands(axes, view, keep, column)
@@ -302,11 +302,17 @@ def _draw_lights(figure: Figure, view: RunView) -> None:
 
 
 def _spans(view: RunView, which: np.ndarray) -> list[tuple[float, float]]:
-    """Stretches (start s, length s) of the frames (N,) that are meant, each up to the frame after it."""
-    t = view.t_s
-    typical = float(np.nanmedian(np.diff(t))) if np.isfinite(t).sum() > 1 else 1.0
+    """Stretches (start s, length s) of the frames (N,) that are meant, each up to the frame after it.
+
+    In long runs frames are taken together, so that a single one is still seen.
+    """
+    known = np.isfinite(view.t_s)
+    starts = np.arange(0, known.sum(), max(1, -(-int(known.sum()) // _MOST_POINTS)))
+    t = view.t_s[known][starts]
+    which = np.logical_or.reduceat(which[known], starts) if len(starts) else which[:0]
+    typical = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
     spans = []
-    for wanted, group in groupby(np.flatnonzero(np.isfinite(t)), key=lambda k: bool(which[k])):
+    for wanted, group in groupby(range(len(t)), key=lambda k: bool(which[k])):
         frames = list(group)
         if wanted:
             spans.append((float(t[frames[0]]), float(t[frames[-1]] - t[frames[0]]) + max(typical, 1e-3)))
@@ -411,7 +417,7 @@ def _draw_errors(figure: Figure, narrow: bool, views: Sequence[RunView]) -> None
     for k, (axes, kind) in enumerate(zip(panels, KINDS, strict=True)):
         label, scale = _SHOWN[kind]
         for n, view in enumerate(views):
-            keep, color = _thinned(view), COLORS[_RUN_COLORS[n % len(_RUN_COLORS)]]
+            keep, color = _thinned(view, _MOST_POINTS // len(views)), COLORS[_RUN_COLORS[n % len(_RUN_COLORS)]]
             error = np.maximum(view.errors[keep, k] * scale, 1e-4)
             axes.scatter(
                 view.true_position[keep, 2], error, s=6, color=color, lw=0, label=view.name if k == 0 else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from lumidock.campaign import plan, run_shard
 from lumidock.campaign_table import row_of
 from lumidock.config import Config, PaperConfig
 from lumidock.datatypes import Array, Fix, Frame
+from lumidock.errors import FrameError
 from lumidock.localizer import Localizer
 from lumidock.metrics import evaluate, true_poses
 from lumidock.paper import PaperLocalizer, btekf
@@ -26,6 +28,7 @@ from lumidock.sim.scenario import Scenario, load_scenario, spurious_paths, traje
 from lumidock.sim.sequence import render_frame, write_rendered
 from lumidock.sim.spots import SpotFrame, spot_frames
 from lumidock.station import Station, load_station
+from lumidock.streams.images import read_image
 from lumidock.streams.replay import read_fixes
 from lumidock.streams.runfolder import RunFolder
 from lumidock.streams.sources import open_source
@@ -113,10 +116,10 @@ def _run_method(dock: Dock, method: str, sequence: Path, out: Path) -> dict[str,
 def _warm(method: str, station: Station, camera: Camera, sequence: Path) -> None:
     """Compile before times are taken: the first frames of a machine take seconds more."""
     localizer = _localizer(method, station, camera)
-    items = list(open_source(sequence).items())
-    for item in items[:: max(1, len(items) // 6)]:
-        if isinstance(item, Frame):
-            localizer.process(item)
+    pictures = sorted((sequence / "frames").iterdir())
+    for number, picture in enumerate(pictures[:: max(1, len(pictures) // 6)]):
+        with suppress(FrameError):  # some scenarios have damaged ones
+            localizer.process(Frame(picture.stem, number, read_image(picture)))
 
 
 def reach(run_folder: Path, truth: Path) -> dict[str, Any]:
