@@ -130,10 +130,14 @@ def _envelope(grid: Grid, dock: work.Dock) -> list[Job]:
 
 
 def _point_level(grid: Grid, dock: work.Dock) -> list[Job]:
-    """Every shipped scenario that goes along a path, as bare detections."""
-    names = [name for name in shipped_scenarios() if load_scenario(name).path.kind != "draws"]
+    """Every shipped scenario that goes along a path, as bare detections; those that differ in pictures only, once."""
+    names: dict[str, str] = {}
+    for name in ("approach", *shipped_scenarios()):
+        scenario = load_scenario(name)
+        if scenario.path.kind != "draws":
+            names.setdefault(scenario.model_dump_json(include={"path", "faults", "spots", "config"}), name)
     return [
         Job(f"point-{name}-{seed}", 6, work.campaign, (dock, name, seed, seed + 1))
-        for name in names
+        for name in names.values()
         for seed in range(grid.first_seed, grid.first_seed + grid.point_seeds)
     ]
