@@ -125,7 +125,7 @@ def test_the_version_is_printed_and_nothing_else_done(lumidock):
         (["run", "x", "--out", "y", "--fps", "fast"], "--fps"),
         (["sim", "approach", "--out", "y", "--seed", "-1"], "--seed"),
         (["sim", "approach", "--out", "y", "--seed", "1.5"], "--seed"),
-        (["eval", "x"], "TRUTH"),
+        (["eval", "x"], "x: no such folder"),
     ],
     ids=lambda words: " ".join(words) if isinstance(words, list) else None,
 )

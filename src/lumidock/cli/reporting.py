@@ -77,7 +77,7 @@ def _reproduce(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Repeat every experiment of the paper by both methods, and what it left open, as one page."""
+    """Repeat the paper's experiments by both methods, as one page."""
     from lumidock.reproduce import FULL, QUICK, reproduce
 
     files = shipped_or_path("station", station or DEFAULT_STATION), shipped_or_path("camera", camera or DEFAULT_CAMERA)
