@@ -500,8 +500,8 @@ def test_a_link_to_frames_is_removed_and_not_the_frames(lumidock, sequence, tmp_
 @pytest.mark.parametrize(
     ("words", "match"),
     [
-        (["none", "SEQUENCE"], "none/fixes.csv: No such file"),
-        (["SEQUENCE", "SEQUENCE"], "sequence/fixes.csv: No such file"),
+        (["none", "SEQUENCE"], "none: no such folder"),
+        (["SEQUENCE", "SEQUENCE"], "sequence: neither a run nor a folder with runs"),
         (["RUN", "RUN"], "earlier/truth.csv: No such file"),
         (["RUN", "none"], "none: No such file"),
         (["RUN", "RUN/fixes.csv"], "earlier/fixes.csv: "),
