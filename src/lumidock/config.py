@@ -222,7 +222,6 @@ class TrackConfig(Section):
 
     accel_m_s2: PositiveFloat = 0.3  # white noise on the twist: what a second adds to it, 1 sigma
     accel_rad_s2: PositiveFloat = 0.05
-    lively: PositiveFloat = 5.0  # times both, where a frame does not fit: the vehicle may have been pushed
     start_m_s: PositiveFloat = 1.5  # 1 sigma of the unknown twist at the start
     start_rad_s: PositiveFloat = 0.15
     gate: PositiveFloat = 18.4  # chi-square, 2 dof, 1e-4

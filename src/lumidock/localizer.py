@@ -9,7 +9,7 @@ import numpy as np
 
 from lumidock import detect, integrity, layers, match, track, verify
 from lumidock.camera import Camera
-from lumidock.config import Config, TrackConfig
+from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Fix, Frame, Match, Stage, Status
 from lumidock.errors import FrameError, InputError
 from lumidock.match import Acquisition, Hypothesis, Spots
@@ -75,20 +75,18 @@ class Localizer:
         if reason == "bad_stamp":
             return self._no_fix(detections, "none", reason)
         before = self.beliefs
-        self.beliefs = self._predict(before, detections, self.config.track)
+        self.beliefs = self._predict(before, detections)
         if not self.beliefs:
             self._lose(before)
         if reason:
             return self._no_fix(detections, "coasting" if self.locked else "none", reason)
-        return self._localize(detections, before)
+        return self._localize(detections)
 
-    def _localize(self, detections: Detections, before: list[Track]) -> Fix:
+    def _localize(self, detections: Detections) -> Fix:
         """Both doors meet here: warm first, then cold; then what may be said."""
         seen = match.spots(detections, self._plan, self.config.match)
         followed = self._follow(self.beliefs, seen)
         held = self.locked and bool(followed) and self._holds(followed[0], seen)
-        if self.locked and not held and (lively := self._follow_lively(before, detections, seen)):
-            followed, held = lively, True
         self._failures = 0 if held else self._failures
         if held and not self._overlooks(followed[0], seen):
             self.beliefs = followed
@@ -112,9 +110,9 @@ class Localizer:
             return self._conclude(detections, "acquired")
         return self._no_fix(detections, "none", _why(detections, found))
 
-    def _predict(self, beliefs: list[Track], detections: Detections, config: TrackConfig) -> list[Track]:
+    def _predict(self, beliefs: list[Track], detections: Detections) -> list[Track]:
         """Beliefs at the time of this frame; those without lights for too long, or from the future, are dropped."""
-        t_ns, later = detections.t_ns, []
+        config, t_ns, later = self.config.track, detections.t_ns, []
         for belief in beliefs:
             if belief.t_ns < t_ns <= belief.lights_ns + config.max_gap_s * 1e9:
                 moved = track.predict(belief, t_ns, config)
@@ -136,17 +134,6 @@ class Localizer:
                 weighed = replace(belief, log_weight=belief.log_weight + found.log_evidence)
                 followed.append(track.update(weighed, found.name, seen, self._plan, self.config.track))
         return self._likeliest([belief for belief in followed if belief is not None])
-
-    def _follow_lively(self, before: list[Track], detections: Detections, seen: Spots) -> list[Track]:
-        """The beliefs followed as a vehicle that was pushed would move; none unless four lights or more then agree.
-
-        Their test is the same, so that what no motion explains ends trust at once.
-        """
-        config, times = self.config.track, self.config.track.lively
-        pushed = {"accel_m_s2": times * config.accel_m_s2, "accel_rad_s2": times * config.accel_rad_s2}
-        followed = self._follow(self._predict(before, detections, config.model_copy(update=pushed)), seen)
-        good = bool(followed) and followed[0].n_used >= _MIN_SOLID and self._holds(followed[0], seen)
-        return followed if good else []
 
     def _likeliest(self, beliefs: list[Track]) -> list[Track]:
         """The likeliest first, without those that are out of the question or the same as a likelier one."""
