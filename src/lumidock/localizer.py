@@ -102,7 +102,8 @@ class Localizer:
             return self._conclude(detections, "tracking")
         if held:  # what the track has learned while it overlooked a layer is in doubt too
             self.locked, self._slow = False, None
-        if verify.is_answer(found, self.config.match) and self._lock(found, detections, seen):
+        held_still = followed[:1] if held else []
+        if verify.is_answer(found, self.config.match) and self._lock(found, detections, seen, held_still):
             return self._conclude(detections, "acquired")
         if self.locked:
             return self._coast(detections, self._doubt(followed, seen) or _why(detections, found))
@@ -181,25 +182,37 @@ class Localizer:
         if int((naming.name >= 0).sum()) < _MIN_LIGHTS:
             return None
         expected = match.prior(detections.attitude, self.config.prior)
-        if self.locked and self.beliefs[0].joint:
-            self._slow = track.learned(self.beliefs[0])
         slow = self._slow or track.slow_states(self.station, detections.attitude)
         begun = track.start(
             naming.T_cam_dock, naming.name, detections.t_ns, seen, self._plan, expected, slow, self.config.track
         )
         return None if begun is None else replace(begun, log_weight=naming.log_evidence)
 
-    def _lock(self, found: Acquisition, detections: Detections, seen: Spots) -> bool:
-        """Believe an answer, its flip and, with history, what contradicts it and is not yet out of the question."""
+    def _lock(self, found: Acquisition, detections: Detections, seen: Spots, held: list[Track]) -> bool:
+        """Believe an answer, its flip and, with history, what contradicts it and is not yet out of the question.
+
+        A track that still holds against the answer is believed as much, until the next frames tell.
+        """
         head = found.candidates[0]
         rivals = [c for c in found.candidates[1:] if verify.contradict(c.name, head.name)]
         namings = [head, *found.others, *([] if self.cold else rivals[:_MAX_RIVALS])]
-        begun = [self._start(naming, detections, seen) for naming in namings]
-        if begun[0] is None or not verify.innovation_holds(begun[0], self.config.track):
+        if self.locked and self.beliefs[0].joint:
+            self._slow = track.learned(self.beliefs[0])
+        begun = self._begin(namings, detections, seen)
+        if not begun and self._slow is not None:  # what an earlier track has learned may be wrong
+            self._slow = None
+            begun = self._begin(namings, detections, seen)
+        if not begun:
             return False
-        self.beliefs = self._likeliest([belief for belief in begun if belief is not None])
+        self.beliefs = self._likeliest([*(replace(b, log_weight=head.log_evidence) for b in held), *begun])
         self.locked, self.margin = True, found.margin
         return True
+
+    def _begin(self, namings: list[Hypothesis], detections: Detections, seen: Spots) -> list[Track]:
+        """Tracks from those namings that pass their test; none where the first does not."""
+        begun = [self._start(naming, detections, seen) for naming in namings]
+        holds = [b is not None and verify.innovation_holds(b, self.config.track) for b in begun]
+        return [b for b, good in zip(begun, holds, strict=True) if b is not None and good] if holds[0] else []
 
     def _gather(self, followed: list[Track], found: Acquisition, detections: Detections, seen: Spots) -> bool:
         """Follow every naming that one frame leaves open until one stands out, in this frame too.

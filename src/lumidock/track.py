@@ -205,7 +205,8 @@ def associate(track: Track, seen: Spots, plan: Plan, config: Config) -> Associat
 
 
 def _search(expected: Array, S: Array, shown: Array, seen: Spots, plan: Plan, config: Config) -> Association:
-    """The best naming, without the names that another one nearly as good does not have."""
+    """The best naming, without the names that another one nearly as good does not have; none where they are too many.
+    """
     m = len(shown)
     names, costs = np.full((_LEAVES, m), -1, np.int64), np.empty(_LEAVES)
     found = kernel.associate(
@@ -224,6 +225,8 @@ def _search(expected: Array, S: Array, shown: Array, seen: Spots, plan: Plan, co
         names,
         costs,
     )
+    if found < 0:
+        return Association(np.full(m, -1, np.int64), -np.inf)
     name, worth = names[0], -costs[:found]
     if found > 1:
         others = np.where(names[:found] != name, worth[:, None], -np.inf)

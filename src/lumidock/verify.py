@@ -52,10 +52,10 @@ def contradict(a: Indices, b: Indices) -> bool:
 def is_proven(track: Track, margin: float, config: IntegrityConfig) -> bool:
     """Whether the names meet the stated risk: by the evidence of one frame, or carried by several in a row.
 
-    Names that no single frame could decide (`margin` 0) have to be carried for longer.
+    Names that no single frame could decide (`margin` 0) have to be carried for longer; after a failed test all have to.
     """
     carried = config.carried_frames if margin > 0.0 else config.gathered_frames
-    return margin > config.evidence or track.proof >= carried
+    return track.proof > 0 and (margin > config.evidence or track.proof >= carried)
 
 
 def _named(name: Indices) -> int:

@@ -1,1 +1,35 @@
-"""The hot loops: plain arrays in, plain arrays out, compiled by numba."""
+"""The hot loops: plain arrays in, plain arrays out, compiled by numba.
+
+Numba keeps compiled code by the file that a function stands in, with the code of other files that it calls inside: when
+one of these changes, it is stale. So whatever was compiled from other sources is removed before it can be used.
+"""
+
+import hashlib
+from pathlib import Path
+
+from numba import njit
+
+
+@njit(cache=True)
+def _anything() -> None:
+    """Asked only where numba keeps the code of this folder."""
+
+
+def _remove_stale() -> None:
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    cache = Path(_anything.stats.cache_path)
+    mark = cache / "sources.sha256"
+    if mark.is_file() and mark.read_text(encoding="ascii") == digest.hexdigest():
+        return
+    for path in cache.glob("*.nb[ci]"):
+        path.unlink(missing_ok=True)
+    cache.mkdir(parents=True, exist_ok=True)
+    mark.write_text(digest.hexdigest(), encoding="ascii")
+
+
+try:
+    _remove_stale()
+except OSError:  # another process may be doing the same; numba itself looks for a folder that can be written
+    pass

@@ -19,6 +19,7 @@ from lumidock.datatypes import Array, Indices
 LOG_VOLUME, DETECT, ABSENT, GATE, NEAR_M, FAR_M, ROLL_GATE, BEND, STEADY, PAIR_GATE = range(10)
 LOG_2PI = math.log(2.0 * math.pi)
 HUGE = 1e300
+_ELSEWHERE = 8.0  # log odds of two priors that one solution under both cannot reach
 _EDGE_PX, _SHINES = 3.0, 0.1  # a light this near the edge, or seen this flat (cosine), may be missing at no cost
 
 
@@ -167,8 +168,8 @@ def evidence(
 ) -> float:
     """Log evidence of a naming whose pose is solved anew, in place, under the whole attitude prior.
 
-    The prior is a mixture: a share `STEADY` of vehicles holds its attitude as `expected.steady` says.
-    `H` is left with the normal matrix under the wide part.
+    The prior is a mixture: a share `STEADY` of vehicles holds its attitude as `expected.steady` says. The pose and the
+    normal matrix `H` are those under the wide part, unless it leads to another solution that is out of the question.
     """
     q = expected.q
     fitted = fit(name, lights, seen, R, t, expected.Rp, expected.info, steps, H, L)
@@ -178,6 +179,8 @@ def evidence(
     Rn, tn, Hn = R.copy(), t.copy(), np.empty((6, 6))
     fitted = fit(name, lights, seen, Rn, tn, expected.Rp, expected.steady, steps, Hn, L)
     narrow = log_evidence(name, lights, seen, Rn, tn, expected.steady, q, fitted)
+    if narrow > wide + _ELSEWHERE:
+        R[:], t[:], H[:] = Rn, tn, Hn
     return log_add(wide + math.log(1.0 - q[STEADY]), narrow + math.log(q[STEADY]))
 
 

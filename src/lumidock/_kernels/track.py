@@ -258,31 +258,23 @@ def associate(
 ) -> int:
     """The most probable namings under the prediction, best first: `names` (K, M), `costs` (K,); returns how many.
 
+    It returns -1 where the search would take more than `max_nodes`: a part of it says nothing.
+
     A depth-first search over the lights, each with the detections in its gate or none; every named light conditions
     those after it through their joint covariance (J. Neira, J. Tardos, 2001). Costs are -log evidence over "all
     clutter"; namings more than `reach` behind the best are not followed.
     """
     m, nd = len(expected), len(uv)
-    cand, n_cand = np.empty((m, 8), np.int64), np.zeros(m, np.int64)
+    cand, n_cand = np.empty((m, nd), np.int64), np.zeros(m, np.int64)
     for c in range(m):
-        if shown[c] == 0.0:
-            continue
-        a, b, d = S[2 * c, 2 * c], S[2 * c, 2 * c + 1], S[2 * c + 1, 2 * c + 1]
-        limit = math.sqrt(gate * (a + d)) + 30.0
-        for i in range(nd):
-            du, dv = uv[i, 0] - expected[c, 0], uv[i, 1] - expected[c, 1]
-            if abs(du) > limit or abs(dv) > limit or n_cand[c] == 8:
-                continue
-            a1, d1 = a + var[i], d + var[i]
-            if d1 * du * du - 2.0 * b * du * dv + a1 * dv * dv < gate * (a1 * d1 - b * b):
-                cand[c, n_cand[c]] = i
-                n_cand[c] += 1
+        if shown[c] > 0.0:
+            n_cand[c] = _in_gate(expected[c], S[2 * c : 2 * c + 2, 2 * c : 2 * c + 2], uv, var, gate, cand[c])
     miss = -math.log(1.0 - detect)
     order, depth, always = np.empty(m, np.int64), 0, 0.0
     for c in range(m):
         if n_cand[c] == 0 and shown[c] == 2.0:
             always += miss
-    for want in range(1, 9):
+    for want in range(1, nd + 1):
         for c in range(m):
             if n_cand[c] == want:
                 order[depth] = c
@@ -313,7 +305,9 @@ def associate(
         k = at[d]
         at[d] += 1
         nodes += 1
-        if k > n_cand[c] or (nodes > max_nodes and found > 0):
+        if nodes > max_nodes:
+            return -1
+        if k > n_cand[c]:
             at[d] = 0
             d -= 1
             continue
@@ -336,6 +330,27 @@ def associate(
         d += 1
         at[d] = 0
     return found
+
+
+@njit(cache=True, error_model="numpy")
+def _in_gate(expected: Array, S: Array, uv: Array, var: Array, gate: float, cand: Indices) -> int:
+    """The detections in a light's gate, the likeliest first: fills `cand` (N,), returns how many."""
+    a, b, d = S[0, 0], S[0, 1], S[1, 1]
+    costs, n = np.empty(len(uv)), 0
+    for i in range(len(uv)):
+        du, dv = uv[i, 0] - expected[0], uv[i, 1] - expected[1]
+        a1, d1 = a + var[i], d + var[i]
+        det = a1 * d1 - b * b
+        nis = (d1 * du * du - 2.0 * b * du * dv + a1 * dv * dv) / det
+        if not nis < gate:
+            continue
+        cost, k = nis + math.log(det), n
+        while k > 0 and costs[k - 1] > cost:
+            costs[k], cand[k] = costs[k - 1], cand[k - 1]
+            k -= 1
+        costs[k], cand[k] = cost, i
+        n += 1
+    return n
 
 
 @njit(cache=True, error_model="numpy")
