@@ -280,12 +280,17 @@ def associate(
                 order[depth] = c
                 depth += 1
     least = np.zeros(m + 1)  # of the cost of all lights from a depth on
+    narrow = np.empty((depth, 3))
+    if depth:
+        _narrowest(S, order[:depth], var.min(), narrow)
     for d in range(depth - 1, -1, -1):
         c = order[d]
         low = miss if shown[c] == 2.0 else 0.0
         for k in range(n_cand[c]):
             i = cand[c, k]
-            low = min(low, _LOG_2PI + math.log(var[i]) - math.log(detect) - like[i, layer[c]] + log_clutter)
+            det = (narrow[d, 0] + var[i]) * (narrow[d, 2] + var[i]) - narrow[d, 1] ** 2
+            price = _LOG_2PI + 0.5 * math.log(max(det, var[i] * var[i]))
+            low = min(low, price - math.log(detect) - like[i, layer[c]] + log_clutter)
         least[d] = least[d + 1] + low
     L, w = np.empty((2 * m, 2 * m)), np.empty(2 * m)
     chosen, count = np.empty(m, np.int64), np.zeros(m + 1, np.int64)
@@ -330,6 +335,30 @@ def associate(
         d += 1
         at[d] = 0
     return found
+
+
+@njit(cache=True, error_model="numpy")
+def _narrowest(S: Array, order: Indices, var: float, narrow: Array) -> None:
+    """Covariance uu, uv, vv (D, 3) of each light's pixel when all before it in `order` (D,) are named.
+
+    With fewer of them named it is wider: what it costs to name a light is never less.
+    """
+    L = np.empty((2 * len(order), 2 * len(order)))
+    for k in range(len(order)):
+        for r in range(2 * k, 2 * k + 2):
+            row = 2 * order[k] + r % 2
+            for j in range(r + 1):
+                s = S[row, 2 * order[j // 2] + j % 2]
+                end = min(j, 2 * k)
+                for i in range(end):
+                    s -= L[r, i] * L[j, i]
+                L[r, j] = s / L[j, j] if j < 2 * k else s
+        n = 2 * k
+        a, b, d = L[n, n], L[n + 1, n], L[n + 1, n + 1]
+        narrow[k, 0], narrow[k, 1], narrow[k, 2] = a, b, d
+        L[n, n] = math.sqrt(max(a, 0.0) + var)
+        L[n + 1, n] = b / L[n, n]
+        L[n + 1, n + 1] = math.sqrt(max(d + var - L[n + 1, n] ** 2, var))
 
 
 @njit(cache=True, error_model="numpy")
