@@ -21,6 +21,7 @@ TWIST, BIAS, CALIBRATION, LIGHTS = 6, 12, 15, 18
 _LOG_2PI = math.log(2.0 * math.pi)
 _LEAVES = 8
 _MARGIN_PX, _SHINES = 3.0, 0.1
+_SETTLED = 0.5  # sigmas; a pose that still moves by more in the last step is none
 _TILT_SIGMAS = 2.5  # of a plane's tilt, for what its square does to the range
 
 
@@ -530,6 +531,7 @@ def update(
     rows, cals, at = np.empty((m, 14)), np.empty((m, 4)), np.empty(3)
     Rf, tf, h, cal = R.copy(), t.copy(), np.empty(14), np.empty(4)
     plain = math.isnan(plane[0])
+    change = 0.0
     _difference(R0, t0, R, t, dx)
     for step in range(steps):
         Rf[:], tf[:] = R, t
@@ -555,7 +557,7 @@ def update(
                 dx[j] += w[r] * G[r, j]
         R[:], t[:], x[:] = R0, t0, x0
         _apply(R, t, x, dx, estimated)
-        change = 0.0
+        change = 0.0  # of the pose since the step before, in sigmas of the prediction
         for j in range(6):
             change = max(change, abs(dx[j] - before[j]) / math.sqrt(P[j, j]))
             before[j] = dx[j]
@@ -563,6 +565,8 @@ def update(
             break
         if step == 0 and change < 0.3 and P[3, 3] + P[4, 4] + P[5, 5] < 1e-4:
             break
+    if tracking and change > _SETTLED:
+        return np.nan
     nis = 0.0
     for r in range(2 * m):
         nis += w[r] * w[r]
