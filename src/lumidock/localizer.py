@@ -209,10 +209,11 @@ class Localizer:
         return True
 
     def _begin(self, namings: list[Hypothesis], detections: Detections, seen: Spots) -> list[Track]:
-        """Tracks from those namings that pass their test; none where the first does not."""
-        begun = [self._start(naming, detections, seen) for naming in namings]
-        holds = [b is not None and verify.innovation_holds(b, self.config.track) for b in begun]
-        return [b for b, good in zip(begun, holds, strict=True) if b is not None and good] if holds[0] else []
+        """Tracks from namings; none where the first does not pass its test."""
+        first, *rest = [self._start(naming, detections, seen) for naming in namings]
+        if first is None or not verify.innovation_holds(first, self.config.track):
+            return []
+        return [first, *(belief for belief in rest if belief is not None)]
 
     def _gather(self, followed: list[Track], found: Acquisition, detections: Detections, seen: Spots) -> bool:
         """Follow every naming that one frame leaves open until one stands out, in this frame too.

@@ -10,12 +10,15 @@ from numba import njit
 from lumidock._kernels.evidence import (
     GATE,
     HUGE,
+    STEADY,
     Expected,
     Lights,
     Seen,
     evidence,
+    fit,
     innovation,
     log_add,
+    log_evidence,
     named,
     survey_var,
 )
@@ -40,7 +43,7 @@ def other_pose(
     """Another pose `R2`, `t2` that fits the same names, and its log evidence; hugely negative where there is but one.
 
     Found from the flipped pose, or, with `level`, from the expected attitude: lights off the axis leave two solutions
-    whose tilts are not opposite.
+    whose tilts are not opposite. Where the steady part of the prior leads back to the first pose, it counts there alone.
     """
     H, L = np.empty((6, 6)), np.empty((6, 6))
     ps, n = np.empty((len(name), 3)), 0
@@ -53,8 +56,18 @@ def other_pose(
         _levelled(ps, n, expected.Rp, R2, t2)
     else:
         flip(ps, n, R2, t2)
-    e = evidence(name, lights, seen, expected, R2, t2, 20, H, L)
-    return -HUGE if turn(R, R2) < SAME_TURN else e
+    q = expected.q
+    fitted = fit(name, lights, seen, R2, t2, expected.Rp, expected.info, 20, H, L)
+    wide = log_evidence(name, lights, seen, R2, t2, expected.info, q, fitted)
+    if wide <= -HUGE or turn(R, R2) < SAME_TURN:
+        return -HUGE
+    if q[STEADY] <= 0.0:
+        return wide
+    Rn, tn = R2.copy(), t2.copy()
+    fitted = fit(name, lights, seen, Rn, tn, expected.Rp, expected.steady, 20, H, L)
+    narrow = log_evidence(name, lights, seen, Rn, tn, expected.steady, q, fitted) + math.log(q[STEADY])
+    wide += math.log(1.0 - q[STEADY])
+    return log_add(wide, narrow) if turn(R, Rn) > turn(R2, Rn) else wide
 
 
 @njit(cache=True, error_model="numpy")
