@@ -277,7 +277,9 @@ def update(
         return None
     count = np.bincount(plan.layer[name >= 0], minlength=plan.n_layers)
     layer_ns = np.where((count >= LAYER_LIGHTS) | (track.layer_ns > _NEVER) & (count > 0), track.t_ns, track.layer_ns)
-    surprise = _deviate(nis, 2 * int(count.sum()))
+    # a pose of which nothing was known takes up six of the pixels' degrees of freedom
+    dof = 2 * int(count.sum()) - (0 if at is None else 6)
+    surprise = _deviate(nis, dof) if dof > 0 else 0.0
     proof = track.proof + int(count.sum() >= _PROOF_LIGHTS)
     return Track(
         track.t_ns,
