@@ -135,8 +135,7 @@ def search(
             if tries[o, 0] < max(_wanted(goal, layers) - 2, 1):
                 break
             i, j, z, roll = int(tries[o, 1]), int(tries[o, 2]), tries[o, 3], tries[o, 4]
-            if True:
-                count = _try_pair(a, b, i, j, z, roll, lights, seen, expected, by_u, view, thirds, goal, count, listed)
+            count = _try_pair(a, b, i, j, z, roll, lights, seen, expected, by_u, view, thirds, goal, count, listed)
         if goal.budget[0] < 0:
             break
     H, L = view.work[0], view.work[1]
