@@ -226,7 +226,7 @@ class TrackConfig(Section):
     start_rad_s: PositiveFloat = 0.15
     gate: PositiveFloat = 18.4  # chi-square, 2 dof, 1e-4
     reach: PositiveFloat = 10.0  # log evidence; namings farther behind the best are not followed
-    max_nodes: PositiveInt = 100_000  # of the association's search, some 0.1 us each; a frame that wants more is not followed
+    max_nodes: PositiveInt = 100_000  # of the association's search, 0.1 us each; a belief that wants more is dropped
     log_appear: float = -6.9  # log prior that a layer comes into view in one frame
     joint_lights: PositiveInt = 3  # of each of two layers, before survey and calibration are estimated
     max_gap_s: PositiveFloat = 2.0  # without lights; after it only survey and calibration are kept

@@ -205,8 +205,7 @@ def associate(track: Track, seen: Spots, plan: Plan, config: Config) -> Associat
 
 
 def _search(expected: Array, S: Array, shown: Array, seen: Spots, plan: Plan, config: Config) -> Association:
-    """The best naming, without the names that another one nearly as good does not have; none where they are too many.
-    """
+    """The best naming, without names that another nearly as good does not have; none where they are too many."""
     m = len(shown)
     names, costs = np.full((_LEAVES, m), -1, np.int64), np.empty(_LEAVES)
     found = kernel.associate(

@@ -5,6 +5,7 @@ one of these changes, it is stale. So whatever was compiled from other sources i
 """
 
 import hashlib
+from contextlib import suppress
 from pathlib import Path
 
 from numba import njit
@@ -19,7 +20,9 @@ def _remove_stale() -> None:
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
-    cache = Path(_anything.stats.cache_path)
+    if (folder := _anything.stats.cache_path) is None:
+        return
+    cache = Path(folder)
     mark = cache / "sources.sha256"
     if mark.is_file() and mark.read_text(encoding="ascii") == digest.hexdigest():
         return
@@ -29,7 +32,5 @@ def _remove_stale() -> None:
     mark.write_text(digest.hexdigest(), encoding="ascii")
 
 
-try:
+with suppress(OSError):  # another process may be doing the same; numba itself looks for a folder that can be written
     _remove_stale()
-except OSError:  # another process may be doing the same; numba itself looks for a folder that can be written
-    pass

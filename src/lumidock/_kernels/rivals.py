@@ -43,7 +43,7 @@ def other_pose(
     """Another pose `R2`, `t2` that fits the same names, and its log evidence; hugely negative where there is but one.
 
     Found from the flipped pose, or, with `level`, from the expected attitude: lights off the axis leave two solutions
-    whose tilts are not opposite. Where the steady part of the prior leads back to the first pose, it counts there alone.
+    whose tilts are not opposite. Where the steady part of the prior leads back to the first pose, it counts there.
     """
     H, L = np.empty((6, 6)), np.empty((6, 6))
     ps, n = np.empty((len(name), 3)), 0
