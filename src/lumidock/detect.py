@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from lumidock._kernels import detect as kernels
-from lumidock._kernels import tiles
+from lumidock._kernels import fields, tiles
 from lumidock.config import DetectConfig
 from lumidock.datatypes import Array, Detections, Frame, Indices
 
@@ -52,7 +52,7 @@ class Scan:
         self.spread = np.ones(maps)
         self.seen = np.zeros((h, w), np.uint8)
         self.found = np.empty((h * w, 5))
-        self.spots = np.empty((config.max_spots, kernels.COLUMNS))
+        self.spots = np.empty((config.max_spots, fields.COLUMNS))
         self.whole = np.array([[0, h, 0, w]])
         self.shared = np.ones(4)
         self.least_noise = config.min_noise * (1.0 if dtype == np.uint8 else _TWELVE_BITS * _SIXTEEN)
@@ -93,17 +93,17 @@ class Scan:
 
 def _parameters(config: DetectConfig, longer_side: int, least_noise: float) -> Array:
     """The numbers that the kernel takes, in its order."""
-    q = np.empty(kernels.PARAMETERS)
-    q[kernels.CONTRAST], q[kernels.MIN_SNR], q[kernels.RING_PX] = config.contrast, config.min_snr, config.ring_px
-    q[kernels.MAX_RADIUS_PX] = max(config.max_radius * longer_side, 2.0 * config.ring_px)
-    q[kernels.MIN_RADIUS_PX], q[kernels.SMALL_PX] = config.min_radius_px, config.small_px
-    q[kernels.MIN_ELONGATION], q[kernels.MIN_FILL] = config.min_elongation, config.min_fill
-    q[kernels.SIGNAL_NOISE], q[kernels.FLOOR_PX] = config.signal_noise, config.floor_px
-    q[kernels.SATURATED_PX], q[kernels.CUT_SHARE] = config.saturated_px, config.cut
-    q[kernels.GLINT_RADII], q[kernels.GLINT_RATIO] = config.glint_radii, config.glint_ratio
-    q[kernels.GLINT_TRUST], q[kernels.CLIPPED], q[kernels.MIN_NOISE] = config.glint_trust, _SATURATED, least_noise
-    q[kernels.PROMINENT], q[kernels.COARSE_PX] = config.prominent, config.coarse_px
-    q[kernels.KIN], q[kernels.LAMPS], q[kernels.RANGE] = config.kin, config.lamps, config.flux_range
+    q = np.empty(fields.PARAMETERS)
+    q[fields.CONTRAST], q[fields.MIN_SNR], q[fields.RING_PX] = config.contrast, config.min_snr, config.ring_px
+    q[fields.MAX_RADIUS_PX] = max(config.max_radius * longer_side, 2.0 * config.ring_px)
+    q[fields.MIN_RADIUS_PX], q[fields.SMALL_PX] = config.min_radius_px, config.small_px
+    q[fields.MIN_ELONGATION], q[fields.MIN_FILL] = config.min_elongation, config.min_fill
+    q[fields.SIGNAL_NOISE], q[fields.FLOOR_PX] = config.signal_noise, config.floor_px
+    q[fields.SATURATED_PX], q[fields.CUT_SHARE] = config.saturated_px, config.cut
+    q[fields.GLINT_RADII], q[fields.GLINT_RATIO] = config.glint_radii, config.glint_ratio
+    q[fields.GLINT_TRUST], q[fields.CLIPPED], q[fields.MIN_NOISE] = config.glint_trust, _SATURATED, least_noise
+    q[fields.PROMINENT], q[fields.COARSE_PX] = config.prominent, config.coarse_px
+    q[fields.KIN], q[fields.LAMPS], q[fields.RANGE] = config.kin, config.lamps, config.flux_range
     return q
 
 
@@ -115,7 +115,7 @@ def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None, expecte
     detections.
     """
     if min(frame.image.shape[:2]) < _LEAST_SIDE:
-        return _detections(frame, np.empty((0, kernels.COLUMNS)))
+        return _detections(frame, np.empty((0, fields.COLUMNS)))
     scan = scan if scan is not None and scan.fits(frame) else Scan(frame, config)
     rows = np.ascontiguousarray(frame.image).reshape(len(frame.image), -1)
     rects = scan.windows(expected) if expected is not None and scan.swept else scan.whole
@@ -162,7 +162,7 @@ def _search(frame: Frame, rows: Array, scan: Scan, rects: Indices, config: Detec
         scan.found,
         scan.spots,
     )
-    scan.last = scan.spots[:n, [kernels.U, kernels.V, kernels.RADIUS]]
+    scan.last = scan.spots[:n, [fields.U, fields.V, fields.RADIUS]]
     return _detections(frame, scan.spots[:n])
 
 
@@ -171,10 +171,10 @@ def _detections(frame: Frame, spots: Array) -> Detections:
         frame.name,
         frame.t_ns,
         spots[:, :2].copy(),
-        spots[:, kernels.RADIUS].copy(),
-        spots[:, kernels.FLUX].copy(),
-        spots[:, kernels.P_LIGHT].copy(),
+        spots[:, fields.RADIUS].copy(),
+        spots[:, fields.FLUX].copy(),
+        spots[:, fields.P_LIGHT].copy(),
         np.full(len(spots), np.nan),
-        spots[:, [kernels.VAR_UU, kernels.VAR_UV, kernels.VAR_UV, kernels.VAR_VV]].reshape(-1, 2, 2),
+        spots[:, [fields.VAR_UU, fields.VAR_UV, fields.VAR_UV, fields.VAR_VV]].reshape(-1, 2, 2),
         frame.attitude,
     )

@@ -14,40 +14,30 @@ TILE_PX, BLOCK = 8, 8  # pixels a side of a tile, tiles a side of a block
 SPARSE = 4  # one block in so many says how samples share their noise
 _FAR = 4  # tiles at which the slopes of a wide light show
 _SIGMA = 0.5117  # of the mean absolute second difference of normal noise: sqrt(pi / 12)
-# compare-exchanges that sort eight values. Source: K. E. Batcher, 1968
-_LOW = np.array([0, 2, 4, 6, 0, 1, 4, 5, 1, 5, 0, 1, 2, 3, 2, 3, 1, 3, 5])
-_LOW_OF_FIVE, _HIGH_OF_FIVE = np.array([0, 1, 0, 1, 0, 2, 1, 3, 2]), np.array([3, 4, 2, 3, 1, 4, 2, 4, 3])
-_HIGH = np.array([1, 3, 5, 7, 2, 3, 6, 7, 2, 6, 4, 5, 6, 7, 4, 5, 2, 4, 6])
 
 
 @njit(cache=True)
-def refresh(rows: Image, planes: int, rect: Indices, peak: Image, line: Image) -> int:
+def refresh(rows: Image, planes: int, rect: Indices, peak: Image, line: Image) -> None:
     """Write the largest values of each tile of `rect` into `peak` (P, h, w); `rect` is two rows and two columns.
 
     One map for mono; for `planes` 3 one for each channel; for a mosaic, `planes` 4, the corners of its 2 x 2 cell that
     stand on one diagonal are one map if they are alike, so that there are three: a light in one colour must not hide
-    behind the background of another. `line` (2, n) is scratch, n = (W + 16) times the channels. Returns the largest
-    value.
+    behind the background of another. `line` (2, n) is scratch, n = (W + 16) times the channels.
     """
     height = len(rows)
     channels = 3 if planes == 3 else 1
     span = TILE_PX * channels
     left, right = rect[2] * span, min(rect[3] * span, rows.shape[1])
     n, padded = right - left, (rect[3] - rect[2]) * span
-    highest = 0
-    line[:, n:padded] = 0
     for i in range(rect[0], rect[1]):
-        top, bottom = i * TILE_PX, min((i + 1) * TILE_PX, height)
-        # read in the order of memory: eight rows at a time alone would keep the memory waiting
-        for v in range(top, bottom):
-            highest = max(highest, _largest(rows[v, left:right]))
-        part = rows[top:bottom, left:right]
+        part = rows[i * TILE_PX : min((i + 1) * TILE_PX, height), left:right]
+        line[:, n:padded] = 0
         if planes == 4:
             _max_of_rows(part[0::2], line[0, :n])
-            _max_of_rows(part[1::2] if bottom - top > 1 else part, line[1, :n])
+            _max_of_rows(part[1::2] if len(part) > 1 else part, line[1, :n])
             _largest_of_mosaic(line[0, :padded], line[1, :padded], peak[:, i, rect[2] : rect[3]])
             continue
-        if bottom == top + TILE_PX:
+        if len(part) == TILE_PX:
             _max_of_eight(part, line[0, :n])
         else:
             _max_of_rows(part, line[0, :n])
@@ -55,16 +45,6 @@ def refresh(rows: Image, planes: int, rect: Indices, peak: Image, line: Image) -
             _largest_of_tiles(line[0, :padded], peak[0, i, rect[2] : rect[3]])
         else:
             _largest_of_wide_tiles(line[0, :padded], line[1, :padded], peak[:, i, rect[2] : rect[3]])
-        line[:, n:padded] = 0
-    return highest
-
-
-@njit(cache=True)
-def _largest(row: Image) -> int:
-    highest = row[0]
-    for x in range(len(row)):
-        highest = row[x] if row[x] > highest else highest
-    return int(highest)
 
 
 @njit(cache=True)
@@ -151,13 +131,14 @@ def survey(
     slope reaches, of every other pixel, which a mosaic does not.
     """
     rect = np.array([0, 0, 0, peak.shape[2]])
+    difference = np.zeros((2, rows.shape[1]), np.int32)
     for b in range(blocks[0], blocks[1]):
         rect[0], rect[1] = b * BLOCK, min((b + 1) * BLOCK, peak.shape[1])
         refresh(rows, planes, rect, peak, line)
         for p in range(len(peak)):
             _levels(peak[p], b, level[p])
         v = min(b * BLOCK * TILE_PX + 3 * TILE_PX, (len(rows) - 2) & -2)
-        _noise(rows[v], rows[v + 1], planes, sigma[b], by_plane[:, :, b])
+        _noise(rows[v], rows[v + 1], planes, difference, sigma[b], by_plane[:, :, b])
 
 
 @njit(cache=True)
@@ -168,22 +149,53 @@ def revisit(rows: Image, planes: int, rects: Indices, peak: Image, line: Image) 
 
 
 @njit(cache=True)
-def _noise(even: Image, odd: Image, planes: int, sigma: Array, by_plane: Array) -> None:
-    """The noise of one row of blocks, from an even and, of a mosaic, an odd row of pixels, see `survey`."""
+def _noise(even: Image, odd: Image, planes: int, difference: Indices, sigma: Array, by_plane: Array) -> None:
+    """The noise of one row of blocks, from an even and, of a mosaic, an odd row of pixels, see `survey`.
+
+    `difference` (2, W * channels) is scratch: second differences of either row.
+    """
     channels = 3 if planes == 3 else 1
     n = min(BLOCK * TILE_PX * channels, len(even))
+    step = 2 * channels
+    _second_differences(even, step, difference[0])
+    if planes == 4:
+        _second_differences(odd, step, difference[1])
     for k in range(len(sigma)):
         low = max(min(k * BLOCK * TILE_PX * channels, len(even) - n), 0)
-        sigma[k] = _SIGMA * _second_difference(even[low : low + n], 2 * channels)
-        if k % SPARSE == 0:
-            for p in range(by_plane.shape[1]):
-                if planes == 4:  # corners 0, 2 and 3 of the cell
-                    own = (odd if p else even)[(low & -2) + (p == 2) : low + n : 2]
-                    by_plane[0, p, k // SPARSE] = _SIGMA * _second_difference(own, 1)
-                    continue
-                own = even[low + p : low + n : channels]
-                by_plane[0, p, k // SPARSE] = _SIGMA * _second_difference(own, 2)
-                by_plane[1, p, k // SPARSE] = _SIGMA * _second_difference_of_sums(own)
+        last = low + n - 2 * step
+        sigma[k] = _SIGMA * _mean(difference[0], low, last, 1)
+        if k % SPARSE:
+            continue
+        for p in range(by_plane.shape[1]):
+            if planes == 4:  # corners 0, 2 and 3 of the cell
+                own = _mean(difference[1 if p else 0], (low & -2) + (p == 2), last, 2)
+            else:
+                own = _mean(difference[0], low + p, last, channels) if channels > 1 else sigma[k] / _SIGMA
+                by_plane[1, p, k // SPARSE] = _SIGMA * _second_difference_of_sums(even[low + p : low + n : channels])
+            by_plane[0, p, k // SPARSE] = _SIGMA * own
+
+
+@njit(cache=True)
+def _second_differences(row: Image, step: int, out: Indices) -> None:
+    """Absolute second differences of samples `step` apart."""
+    n = max(len(row) - 2 * step, 0)
+    a, b, c, d = row[:n], row[step : n + step], row[2 * step :], out[:n]
+    for x in range(n):
+        d[x] = abs(np.int32(a[x]) - np.int32(2) * np.int32(b[x]) + np.int32(c[x]))
+
+
+@njit(cache=True)
+def _mean(values: Indices, first: int, last: int, step: int) -> float:
+    """Mean of every so many of `values`, 0 where there are none."""
+    part = values[first : max(last, first)]
+    total = 0
+    if step == 1:
+        for x in range(len(part)):
+            total += part[x]
+        return total / max(len(part), 1)
+    for x in range(0, len(part), step):
+        total += part[x]
+    return total / max((len(part) + step - 1) // step, 1)
 
 
 @njit(cache=True)
@@ -212,21 +224,8 @@ def settle(
     typical = np.median(sigma[::2, ::2].copy())
     for p in range(len(level)):
         own = np.median(by_plane[0, p].copy())
-        spread[p] = min(max(own / typical, 0.3), 3.0)
+        spread[p] = min(max(own / typical, 0.3, least / typical), 3.0)  # less than a step of the sensor is none
         shared[p] = min(max((np.median(by_plane[1, p].copy()) / max(own, 0.7 * least)) ** 2, 1.0), most)
-
-
-@njit(cache=True)
-def _second_difference(row: Image, step: int) -> float:
-    """Mean absolute second difference of samples `step` apart."""
-    n = len(row) - 2 * step
-    if n <= 0:
-        return 0.0
-    a, b, c = row[:n], row[step : n + step], row[2 * step :]
-    total = np.int32(0)
-    for x in range(n):
-        total += abs(np.int32(a[x]) - np.int32(2) * np.int32(b[x]) + np.int32(c[x]))
-    return total / n
 
 
 @njit(cache=True)
@@ -250,51 +249,57 @@ def _second_difference_of_sums(row: Image) -> float:
 def _levels(peak: Image, b: int, level: Image) -> None:
     """Write the median of the tiles of each block of one row of blocks, row by row and then of those, to `level[b]`."""
     h, w = peak.shape
-    columns, rows = np.empty((8, w), peak.dtype), np.empty((8, level.shape[1]), peak.dtype)
-    for k in range(8):
-        columns[k] = peak[min(b * BLOCK + k, h - 1)]
-    _sort_columns(columns)
+    i = b * BLOCK
+    columns, rows = np.empty(w, peak.dtype), np.empty((BLOCK, level.shape[1]), peak.dtype)
+    if i + BLOCK <= h:
+        _middle_of_eight(peak[i : i + BLOCK], columns)
+    else:
+        last = np.empty((BLOCK, w), peak.dtype)
+        for k in range(BLOCK):
+            last[k] = peak[min(i + k, h - 1)]
+        _middle_of_eight(last, columns)
     for j in range(level.shape[1]):
-        for k in range(8):
-            rows[k, j] = columns[4, min(j * BLOCK + k, w - 1)]
-    _sort_columns(rows)
-    level[b] = rows[4]
+        for k in range(BLOCK):
+            rows[k, j] = columns[min(j * BLOCK + k, w - 1)]
+    _middle_of_eight(rows, level[b])
+
+
+@njit(cache=True)
+def _middle_of_eight(r: Image, out: Image) -> None:
+    """Write the fifth smallest of each column of `r` (8, n) to `out`: of two sorted halves."""
+    for x in range(len(out)):
+        a, b, c, d = _sorted_four(r[0, x], r[1, x], r[2, x], r[3, x])
+        e, f, g, h = _sorted_four(r[4, x], r[5, x], r[6, x], r[7, x])
+        out[x] = min(min(max(a, h), max(b, g)), min(max(c, f), max(d, e)))
+
+
+@njit(cache=True)
+def _sorted_four(a: float, b: float, c: float, d: float) -> tuple[float, float, float, float]:
+    a, b, c, d = min(a, b), max(a, b), min(c, d), max(c, d)
+    a, c, b, d = min(a, c), max(a, c), min(b, d), max(b, d)
+    return a, min(b, c), max(b, c), d
 
 
 @njit(cache=True)
 def _smoothed(values: Array, out: Array) -> None:
     """Write the median of five columns of the medians of five rows around each of `values` (h, w) to `out`."""
     h, w = values.shape
-    rows, columns = np.empty((8, w), np.float32), np.empty((8, w), np.float32)
+    middle = np.empty(w + 4, np.float32)
     for i in range(h):
-        for k in range(5):
-            rows[k] = values[min(max(i + k - 2, 0), h - 1)]
-        _sort_columns_of_five(rows)
+        a, b = values[max(i - 2, 0)], values[max(i - 1, 0)]
+        c, d, e = values[i], values[min(i + 1, h - 1)], values[min(i + 2, h - 1)]
+        inner, row = middle[2 : w + 2], out[i]
         for j in range(w):
-            for k in range(5):
-                columns[k, j] = rows[2, min(max(j + k - 2, 0), w - 1)]
-        _sort_columns_of_five(columns)
-        out[i] = columns[2]
+            inner[j] = _median_of_five(a[j], b[j], c[j], d[j], e[j])
+        middle[:2], middle[w + 2 :] = middle[2], middle[w + 1]
+        for j in range(w):
+            row[j] = _median_of_five(middle[j], middle[j + 1], middle[j + 2], middle[j + 3], middle[j + 4])
 
 
 @njit(cache=True)
-def _sort_columns_of_five(values: Array) -> None:
-    for k in range(len(_LOW_OF_FIVE)):
-        _exchange(values[_LOW_OF_FIVE[k]], values[_HIGH_OF_FIVE[k]])
-
-
-@njit(cache=True)
-def _sort_columns(values: Image) -> None:
-    """Sort each column of `values` (8, n)."""
-    for k in range(len(_LOW)):
-        _exchange(values[_LOW[k]], values[_HIGH[k]])
-
-
-@njit(cache=True)
-def _exchange(a: Image, b: Image) -> None:
-    for x in range(len(a)):
-        low, high = min(a[x], b[x]), max(a[x], b[x])
-        a[x], b[x] = low, high
+def _median_of_five(a: float, b: float, c: float, d: float, e: float) -> float:
+    f, g = max(min(a, b), min(c, d)), min(max(a, b), max(c, d))
+    return max(min(f, g), min(max(f, g), e))
 
 
 @njit(cache=True)
@@ -316,7 +321,7 @@ def candidates(
     to it or a few tiles away they are darker by a margin, as on a halo they are not. Tiles that are `seen` (h, w) are
     left out, and the others become it. Returns how many there are.
     """
-    count, least = 0, np.empty(peak.shape[1], peak.dtype)
+    count, least, worth = 0, np.empty(peak.shape[1], peak.dtype), np.empty(peak.shape[1], np.uint8)
     for i in range(rect[0], rect[1]):
         b = i // BLOCK
         if i == rect[0] or i % BLOCK == 0:
@@ -324,10 +329,10 @@ def candidates(
                 value = min(np.ceil(level[b, k] + contrast * spread * sigma[b, k]), clipped)
                 for j in range(max(k * BLOCK, rect[2]), min((k + 1) * BLOCK, rect[3])):
                     least[j] = value
-        if not _any_reaches(peak[i, rect[2] : rect[3]], least[rect[2] : rect[3]]):
+        if not _worth_a_look(peak[i], least, rect[2], rect[3], worth):
             continue
         for j in range(rect[2], rect[3]):
-            if peak[i, j] < least[j] or seen[i, j] or count == len(found):
+            if not worth[j] or seen[i, j] or count == len(found):
                 continue
             here = spread * sigma[b, j // BLOCK]
             if not _stands_out(peak, i, j, int(1.5 * contrast * here), int(clipped)):
@@ -340,11 +345,19 @@ def candidates(
 
 
 @njit(cache=True)
-def _any_reaches(values: Image, least: Image) -> bool:
-    reached = False
-    for j in range(len(values)):
-        reached |= values[j] >= least[j]
-    return reached
+def _worth_a_look(row: Image, least: Image, first: int, last: int, worth: Image) -> bool:
+    """Mark the tiles of a part of a row that reach the `least` value and stand on no slope along it; whether any."""
+    here, limit, mark = row[first:last], least[first:last], worth[first:last]
+    total = 0
+    for x in range(len(here)):
+        mark[x] = here[x] >= limit[x]
+        total += mark[x]
+    if total == 0:
+        return False
+    left, middle, right, inner = here[:-2], here[1:-1], here[2:], mark[1:-1]
+    for x in range(len(inner)):
+        inner[x] &= 2 * np.int32(middle[x]) >= np.int32(left[x]) + np.int32(right[x])
+    return True
 
 
 @njit(cache=True)

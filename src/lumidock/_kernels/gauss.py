@@ -1,0 +1,272 @@
+"""The maximum-likelihood centre of a small light: a round Gaussian on each colour's own samples."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from lumidock.datatypes import Array, Image
+
+_ROUNDS, _REACH = 6, 9
+_PRIOR_DOF = 20.0  # how much the expected noise counts beside the residuals of a fit
+
+
+@njit(cache=True)
+def fit(
+    image: Image,
+    planes: int,
+    scale: float,
+    weight: Array,
+    slope: tuple[float, float],
+    center: Array,
+    width: float,
+    noise: float,
+    signal_noise: float,
+    clipped: float,
+    cov: Array,
+) -> float:
+    """Move `center` (2,) to the maximum-likelihood position of a round Gaussian; its covariance goes to `cov` (3,).
+
+    Position and width are common, amplitude and background are of each plane and eliminated (variable projection), so
+    that a mosaic's coarse planes bias nothing; saturated samples are left out, which is how the wings of a small
+    clipped light give its centre. The residuals scale the covariance. Returns the width, 0 where the fit does not
+    settle, which leaves everything as it was.
+    """
+    reach = min(max(int(np.ceil(2.2 * width)) + 1, 3 if planes < 4 else 4), _REACH)
+    u0, v0 = int(np.floor(center[0] + 0.5)), int(np.floor(center[1] + 0.5))
+    left, right = max(u0 - reach, 0), min(u0 + reach + 1, image.shape[1])
+    top, bottom = max(v0 - reach, 0), min(v0 + reach + 1, image.shape[0])
+    parts, pitch = (4, 2) if planes == 4 else (1, 1)
+    ex, ey = np.empty(right - left), np.empty(bottom - top)
+    z = np.empty((bottom - top, right - left))
+    _read(image, planes, scale, weight, slope, left, top, u0, v0, clipped, z)
+    u, v, s = center[0], center[1], width
+    amplitude, ground = np.zeros(4), np.zeros(4)
+    dx, dy = 1.0, 1.0
+    S, right_side = np.zeros((3, 3)), np.zeros(3)
+    for turn in range(_ROUNDS):
+        for j in range(right - left):
+            ex[j] = np.exp(-0.5 * ((left + j - u) / s) ** 2)
+        for i in range(bottom - top):
+            ey[i] = np.exp(-0.5 * ((top + i - v) / s) ** 2)
+        S[:], right_side[:] = 0.0, 0.0
+        for p in range(parts):
+            i0, j0 = ((p >> 1) - top) % pitch, ((p & 1) - left) % pitch
+            own, gx, gy = z[i0::pitch, j0::pitch], ex[j0::pitch], ey[i0::pitch]
+            used = amplitude[p] if turn > 0 else 0.0
+            amplitude[p], ground[p] = _amplitude(own, gx, gy, noise, signal_noise * max(used, 0.0))
+            at = ((left + j0 - u) / s, (top + i0 - v) / s, pitch / s)
+            _add_equations(own, gx, gy, at, s, noise, signal_noise, amplitude[p], ground[p], S, right_side)
+        S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
+        step, solved = _solve(S, right_side)
+        if not solved:
+            return 0.0
+        dx, dy = step[0], step[1]
+        if np.hypot(dx, dy) > width:
+            return 0.0
+        u, v = u + dx, v + dy
+        s = min(max(s + step[2], 0.7 * s), 1.4 * s)
+        if dx * dx + dy * dy < 1e-5 and turn > 0:
+            break
+    if dx * dx + dy * dy > 1e-2 or np.hypot(u - center[0], v - center[1]) > width or not 0.4 < s < 2.0 * width:
+        return 0.0
+    inverse, solved = _top_left_of_inverse(S)
+    if not solved:
+        return 0.0
+    center[0], center[1] = u, v
+    misfit = _odd_misfit(z, ex, ey, left, top, parts, noise, signal_noise, amplitude, u, v)
+    cov[0], cov[1], cov[2] = inverse[0] * misfit, inverse[1] * misfit, inverse[2] * misfit
+    return s
+
+
+@njit(cache=True)
+def _read(
+    image: Image,
+    planes: int,
+    scale: float,
+    weight: Array,
+    slope: tuple[float, float],
+    left: int,
+    top: int,
+    u: int,
+    v: int,
+    clipped: float,
+    z: Array,
+) -> None:
+    """Write the samples from `left`, `top` on to `z`, without the slope through u, v; NaN where one is saturated."""
+    for i in range(len(z)):
+        for j in range(z.shape[1]):
+            if planes == 3:
+                mixed, most = 0.0, 0.0
+                for p in range(3):
+                    mixed += weight[p] * image[top + i, left + j, p]
+                    most = max(most, float(image[top + i, left + j, p]) if weight[p] > 0.0 else 0.0)
+            else:
+                mixed = most = float(image[top + i, left + j, 0])
+            z[i, j] = scale * mixed - slope[0] * (left + j - u) - slope[1] * (top + i - v)
+            if scale * most >= clipped:
+                z[i, j] = np.nan
+
+
+@njit(cache=True)
+def _odd_misfit(
+    z: Array,
+    ex: Array,
+    ey: Array,
+    left: int,
+    top: int,
+    parts: int,
+    noise: float,
+    signal_noise: float,
+    amplitude: Array,
+    u: float,
+    v: float,
+) -> float:
+    """How much more the residuals differ between opposite sides than noise would: what is even displaces nothing."""
+    center_i, center_j = int(np.floor(v + 0.5)) - top, int(np.floor(u + 0.5)) - left
+    total, pairs = 0.0, 0
+    for i in range(center_i + 1):
+        for j in range(len(ex)):
+            k, m = 2 * center_i - i, 2 * center_j - j
+            if not (i < k or j < m) or k >= len(ey) or m < 0 or m >= len(ex):
+                continue
+            a, b = z[i, j], z[k, m]
+            if np.isnan(a) or np.isnan(b):
+                continue
+            p = ((top + i) & 1) * 2 + ((left + j) & 1) if parts == 4 else 0
+            g, h = amplitude[p] * ex[j] * ey[i], amplitude[p] * ex[m] * ey[k]
+            odd = a - g - b + h
+            total += odd * odd / (2.0 * noise * noise + signal_noise * (max(g, 0.0) + max(h, 0.0)))
+            pairs += 1
+    return (_PRIOR_DOF + total) / (_PRIOR_DOF + pairs)
+
+
+@njit(cache=True)
+def _amplitude(z: Array, gx: Array, gy: Array, noise: float, signal_noise: float) -> tuple[float, float]:
+    """Least-squares amplitude and background of one plane under the present profile, samples of which are NaN left out.
+
+    `signal_noise` is the variance that the profile adds to the noise's where it is 1.
+    """
+    gg, g1, n, gz, z1 = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(len(gy)):
+        row, b = z[i], gy[i]
+        for j in range(len(gx)):
+            value = row[j]
+            if np.isnan(value):
+                continue
+            g = gx[j] * b
+            w = 1.0 / (noise * noise + signal_noise * g)
+            gg += w * g * g
+            g1 += w * g
+            n += w
+            gz += w * g * value
+            z1 += w * value
+    det = gg * n - g1 * g1
+    if n > 0.0 and det > 1e-9 * gg * n:
+        return (n * gz - g1 * z1) / det, (gg * z1 - g1 * gz) / det
+    return 0.0, z1 / max(n, 1e-12)
+
+
+@njit(cache=True)
+def _add_equations(
+    z: Array,
+    gx: Array,
+    gy: Array,
+    at: tuple[float, float, float],
+    s: float,
+    noise: float,
+    signal_noise: float,
+    amplitude: float,
+    ground: float,
+    S: Array,
+    right_side: Array,
+) -> None:
+    """Add one plane to the upper triangle of the Schur complement `S` (3, 3) of position and width, and to its side.
+
+    `at`: the first sample's distance from the centre along either axis, and that of two samples, in widths.
+    """
+    a0, b0, pitch = at
+    s00, s01, s02, s11, s12, s22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    r0, r1, r2 = 0.0, 0.0, 0.0
+    gg, g1, n = 0.0, 0.0, 0.0
+    g_j0, g_j1, g_j2, j_0, j_1, j_2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(len(gy)):
+        row, b, e = z[i], b0 + pitch * i, gy[i]
+        for j in range(len(gx)):
+            value = row[j]
+            if np.isnan(value):
+                continue
+            g, a = gx[j] * e, a0 + pitch * j
+            w = 1.0 / (noise * noise + signal_noise * max(amplitude, 0.0) * g)
+            d = amplitude * g / s
+            j0, j1, j2 = d * a, d * b, d * (a * a + b * b)
+            wr, w0, w1, w2, wg = w * (value - ground - amplitude * g), w * j0, w * j1, w * j2, w * g
+            s00 += w0 * j0
+            s01 += w0 * j1
+            s02 += w0 * j2
+            s11 += w1 * j1
+            s12 += w1 * j2
+            s22 += w2 * j2
+            r0 += wr * j0
+            r1 += wr * j1
+            r2 += wr * j2
+            gg += wg * g
+            g1 += wg
+            n += w
+            g_j0 += wg * j0
+            g_j1 += wg * j1
+            g_j2 += wg * j2
+            j_0 += w0
+            j_1 += w1
+            j_2 += w2
+    S[0, 0] += s00
+    S[0, 1] += s01
+    S[0, 2] += s02
+    S[1, 1] += s11
+    S[1, 2] += s12
+    S[2, 2] += s22
+    right_side[0] += r0
+    right_side[1] += r1
+    right_side[2] += r2
+    det = gg * n - g1 * g1
+    if not det > 1e-9 * gg * n:
+        return
+    of_g, of_1 = (g_j0, g_j1, g_j2), (j_0, j_1, j_2)
+    for k in range(3):
+        for m in range(k, 3):
+            mixed = of_g[k] * of_1[m] + of_1[k] * of_g[m]
+            S[k, m] -= (n * of_g[k] * of_g[m] - g1 * mixed + gg * of_1[k] * of_1[m]) / det
+
+
+@njit(cache=True)
+def _solve(S: Array, b: Array) -> tuple[Array, bool]:
+    """Solution (3,) of S x = b by the adjugate."""
+    c0 = S[1, 1] * S[2, 2] - S[1, 2] * S[2, 1]
+    c1 = S[1, 2] * S[2, 0] - S[1, 0] * S[2, 2]
+    c2 = S[1, 0] * S[2, 1] - S[1, 1] * S[2, 0]
+    det = S[0, 0] * c0 + S[0, 1] * c1 + S[0, 2] * c2
+    x = np.zeros(3)
+    if not det > 1e-12 * S[0, 0] * S[1, 1] * S[2, 2]:
+        return x, False
+    x[0] = (
+        c0 * b[0] + (S[0, 2] * S[2, 1] - S[0, 1] * S[2, 2]) * b[1] + (S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]) * b[2]
+    ) / det
+    x[1] = (
+        c1 * b[0] + (S[0, 0] * S[2, 2] - S[0, 2] * S[2, 0]) * b[1] + (S[0, 2] * S[1, 0] - S[0, 0] * S[1, 2]) * b[2]
+    ) / det
+    x[2] = (
+        c2 * b[0] + (S[0, 1] * S[2, 0] - S[0, 0] * S[2, 1]) * b[1] + (S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]) * b[2]
+    ) / det
+    return x, True
+
+
+@njit(cache=True)
+def _top_left_of_inverse(S: Array) -> tuple[tuple[float, float, float], bool]:
+    """The entries uu, uv, vv of the inverse of S (3, 3)."""
+    a = S[0, 0] - S[0, 2] ** 2 / S[2, 2]
+    b = S[0, 1] - S[0, 2] * S[1, 2] / S[2, 2]
+    c = S[1, 1] - S[1, 2] ** 2 / S[2, 2]
+    det = a * c - b * b
+    if not (det > 1e-12 * a * c and a > 0.0):
+        return (0.0, 0.0, 0.0), False
+    return (c / det, -b / det, a / det), True

@@ -1,0 +1,75 @@
+"""How much what was found looks like a lamp: soft, so that geometry can overrule it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from lumidock._kernels import fields
+from lumidock.datatypes import Array
+
+
+@njit(cache=True)
+def lamp_probability(spot: Array, q: Array) -> float:
+    """Probability of being a lamp, from contrast, shape and size: soft, so that geometry can overrule it."""
+    radius = spot[fields.RADIUS]
+    seen = _logistic(spot[fields.SNR] - 8.5)
+    small = np.exp(-radius / 3.0)  # the outline of a small spot says little of its shape
+    round_ = _logistic((spot[fields.ELONGATION] - 0.5) / 0.06)
+    full = _logistic((spot[fields.FILL] - 0.75) / 0.04)
+    shape = small + (1.0 - small) * round_ * full
+    largest = q[fields.MAX_RADIUS_PX]
+    size = _logistic((0.5 * largest - radius) / (0.1 * largest)) * _logistic((radius - q[fields.MIN_RADIUS_PX]) / 0.1)
+    usual = 0.7 if spot[fields.SATURATED] > 0.0 else 0.5
+    alone = 1.0 - 2.0 * max(spot[fields.LEVEL] - usual, 0.0)
+    return float(min(max(seen * shape * size * alone, 0.02), 0.98))
+
+
+@njit(cache=True)
+def _logistic(x: float) -> float:
+    return float(1.0 / (1.0 + np.exp(-x)))
+
+
+@njit(cache=True)
+def dim_glints(spots: Array, n: int, q: Array) -> None:
+    """Make little of a spot near a much stronger one that may be a lamp: its reflection on the frame beside it."""
+    before = spots[:n, fields.P_LIGHT].copy()
+    for k in range(n):
+        for m in range(n):
+            near = (
+                np.hypot(spots[k, fields.U] - spots[m, fields.U], spots[k, fields.V] - spots[m, fields.V])
+                < q[fields.GLINT_RADII] * spots[m, fields.RADIUS]
+            )
+            weaker = (
+                spots[m, fields.FLUX] > q[fields.GLINT_RATIO] * spots[k, fields.FLUX]
+                and spots[m, fields.CORE] > 0.9 * spots[k, fields.CORE]
+            )
+            halo = m < k and spots[k, fields.SATURATED] > 0.0 and spots[k, fields.CORE] < 0.9 * spots[m, fields.CORE]
+            if m != k and near and (weaker or halo) and before[m] > q[fields.GLINT_TRUST] * before[k]:
+                spots[k, fields.P_LIGHT] = max(0.1 * before[k], 0.02)
+                break
+
+
+@njit(cache=True)
+def dim_small_fry(spots: Array, n: int, q: Array) -> None:
+    """Make less of spots that are many of a kind, or faint beside the lamps in view.
+
+    A dock has a dozen or two lamps, of fluxes within a few hundred of each other; a wall or a cloud of snow has crowds.
+    """
+    before = spots[:n, fields.P_LIGHT].copy()
+    brightest = 0.0
+    for k in range(n):
+        if before[k] > 0.5:
+            brightest = max(brightest, spots[k, fields.FLUX])
+    for k in range(n):
+        alike = 0.0
+        for m in range(n):
+            if q[fields.KIN] * spots[m, fields.FLUX] > spots[k, fields.FLUX] > spots[m, fields.FLUX] / q[fields.KIN]:
+                alike += before[m]
+        crowd = 1.0
+        if spots[k, fields.FLUX] < q[fields.PROMINENT] * brightest:
+            crowd = min(1.0, q[fields.LAMPS] / max(alike, 1.0))
+        dim = 1.0
+        if brightest > 0.0 and spots[k, fields.FLUX] > 0.0:
+            dim = _logistic(np.log(spots[k, fields.FLUX] * q[fields.RANGE] / brightest))
+        spots[k, fields.P_LIGHT] = max(before[k] * crowd * dim, 0.02)

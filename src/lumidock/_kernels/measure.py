@@ -1,0 +1,226 @@
+"""One candidate measured in a window of its own: where it ends, and whether it is a spot at all."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from lumidock._kernels import fields, patch, samples, tiles
+from lumidock._kernels.describe import FILTER_PX, describe, index, peak_value, small_snr
+from lumidock._kernels.patch import Window
+from lumidock.datatypes import Array, Image, Indices
+
+LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out, until it is round and alone
+_MAX_TILES = 20  # a light is not wider
+_ROUNDS = 4
+_QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth having clears 1.8
+_LEAST_STEP = 30.0  # levels by which a saturated light stands out in the plane that shows it best
+
+
+@njit(cache=True)
+def measure(
+    image: Image,
+    planes: int,
+    scale: float,
+    peak: Image,
+    i: int,
+    j: int,
+    v: int,
+    u: int,
+    p: int,
+    level: Array,
+    noise: float,
+    shared_by_plane: Array,
+    q: Array,
+    window: Window,
+    seen: Image,
+    spots: Array,
+    n: int,
+) -> int:
+    """Measure the spot of one candidate tile into `spots[n]`: 1 if there is one, 0 if not, -1 if that was cheap."""
+    weight, where, start = np.zeros(4), np.zeros(7), np.zeros(2, np.int64)
+    radius, clipped = 0.0, scale * peak[:, i, j].max() >= q[fields.CLIPPED]
+    if clipped:
+        radius = samples.weigh_clipped(image, planes, scale, v, u, _LEAST_STEP, q[fields.MAX_RADIUS_PX], weight)
+        if radius == 0.0:
+            return -1
+    else:
+        radius = min(_extent(peak, i, j, level), q[fields.MAX_RADIUS_PX])
+        sigma = noise * np.sqrt(shared_by_plane[p])
+        if radius < tiles.TILE_PX and not samples.stands_out(
+            image, planes, scale, p + (p == 2 and planes == 4), v, u, q[fields.RING_PX], sigma, _QUICK
+        ):
+            return -1
+        samples.weigh(image, planes, scale, v, u, radius, weight)
+    shared = (weight**2 * shared_by_plane).sum() / (weight**2).sum()
+    expected = noise * np.sqrt((weight**2).sum())
+    reach = min(max(3.5 * radius, 1.5 * q[fields.RING_PX]), 3.5 * q[fields.MAX_RADIUS_PX])
+    part, ground = 0.0, np.zeros(3)  # level, noise and texture of the surroundings
+    for turn in range(_ROUNDS):
+        patch.cut(image, planes, scale, weight, v, u, reach, patch.COARSE_SIDE, window[0], where)
+        start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
+        ring = 0.9 * reach / where[patch.UNIT]
+        ground[0], spread = patch.flatten(window[0], where, float(start[0]), float(start[1]), ring)
+        ground[1] = max(patch.rim_noise(window[0], where), 0.5 * expected, q[fields.MIN_NOISE] * expected / noise)
+        ground[2] = 0.0 if clipped else np.sqrt(max(spread**2 - 2.0 * ground[1] ** 2, 0.0))
+        if turn == 0 and not clipped:
+            width = max(FILTER_PX / where[patch.UNIT], 0.7)
+            if (
+                small_snr(window[0], where, float(start[0]), float(start[1]), width, ground, shared)
+                < 0.5 * q[fields.MIN_SNR]
+            ):
+                return -1
+        if clipped:
+            patch.smooth(window[0], where)
+        part = _level(image, planes, window, where, start, ground[0], q, spots, n)
+        sums = window[3]
+        if part == 0.0:
+            if not clipped:
+                _own(seen, window[1], where, start)
+                return 0
+            if sums[patch.OPEN] == 0.0 or reach >= 3.5 * q[fields.MAX_RADIUS_PX]:
+                _own_plateau(image, planes, scale, weight, v, u, reach, q, window, where, start, seen)
+                return 0
+            reach = min(2.0 * reach, 3.5 * q[fields.MAX_RADIUS_PX])
+            continue
+        found = np.sqrt(sums[patch.N] / np.pi) * where[patch.UNIT]
+        wanted = min(max(3.5 * found, 1.5 * q[fields.RING_PX]), 3.5 * q[fields.MAX_RADIUS_PX])
+        if 0.6 * reach <= wanted <= 1.25 * reach or turn == _ROUNDS - 1:
+            break
+        reach = wanted
+    if part == 0.0:
+        return 0
+    _own(seen, window[1], where, start)
+    spots[n, fields.CORE] = 0.0
+    for p in range(planes):
+        spots[n, fields.CORE] += samples.core_mean(image, planes, scale, p, v, u) / planes
+    return int(describe(image, planes, scale, weight, window, where, start, u, v, part, ground, shared, q, spots, n))
+
+
+@njit(cache=True)
+def _extent(peak: Image, i: int, j: int, level: Array) -> float:
+    """Radius px that the tiles give a spot at half height: of its narrower side, half a tile at least.
+
+    In the plane in which it stands out most, over the background or what is left of it on the halo of something larger.
+    """
+    p, most = 0, -1e9
+    for k in range(len(peak)):
+        over = float(peak[k, i, j]) - level[k, i // tiles.BLOCK, j // tiles.BLOCK]
+        if over > most:
+            p, most = k, over
+    step = 0
+    for far in (4, 8, 16):
+        step = max(step, tiles.over_pairs(peak[p], i, j, far))
+    half = float(peak[p, i, j]) - 0.5 * min(most, 0.5 * step)
+    width, height = 1, 1
+    for step in (-1, 1):
+        k = 1
+        while k < _MAX_TILES and 0 <= j + step * k < peak.shape[2] and peak[p, i, j + step * k] > half:
+            k += 1
+        width += k - 1
+        k = 1
+        while k < _MAX_TILES and 0 <= i + step * k < peak.shape[1] and peak[p, i + step * k, j] > half:
+            k += 1
+        height += k - 1
+    return 0.5 * tiles.TILE_PX * min(width, height)
+
+
+@njit(cache=True)
+def _level(
+    image: Image,
+    planes: int,
+    window: Window,
+    where: Array,
+    start: Indices,
+    floor: float,
+    q: Array,
+    spots: Array,
+    n: int,
+) -> float:
+    """Grow the spot at the lowest share of its peak where it is round and alone.
+
+    If it is round nowhere, at the lowest where it is alone. Returns the share, 0 where the spot is never alone. A
+    saturated core in one plane is swollen at half height by its halo, which no colour tells apart: there the lowest
+    share is left out.
+    """
+    top = peak_value(window[0], where, start)
+    window[1][:] = 0
+    first = 1 if planes == 1 and top >= q[fields.CLIPPED] else 0
+    fallback = 0.0
+    if top <= floor:
+        return 0.0
+    for k in range(first, len(LEVELS) + 1):
+        again = k == len(LEVELS)
+        if again and fallback == 0.0:
+            return 0.0
+        share = fallback if again else LEVELS[k]
+        patch.grow(window, where, image, start[0], start[1], floor + share * (top - floor), q[fields.CLIPPED], k + 1)
+        sums = window[3]
+        if _holds_another(window[1], where, k + 1, spots, n):
+            sums[patch.OPEN] = 0.0  # a wider window does not help
+            continue
+        if sums[patch.OPEN] > 0.0:
+            continue
+        elongation, fill = patch.shape(sums)
+        if again or sums[patch.N] < 12.0 or (elongation > q[fields.MIN_ELONGATION] and fill > q[fields.MIN_FILL]):
+            return share
+        if fallback == 0.0:
+            fallback = share
+    return 0.0
+
+
+@njit(cache=True)
+def _holds_another(stamp: Image, where: Array, mark: int, spots: Array, n: int) -> bool:
+    """Whether the grown region covers the centre of a spot found before."""
+    for k in range(n):
+        x = int((spots[k, fields.U] - where[patch.LEFT]) / where[patch.UNIT] + 0.5)
+        y = int((spots[k, fields.V] - where[patch.TOP]) / where[patch.UNIT] + 0.5)
+        if 0 <= x < where[patch.COLUMNS] and 0 <= y < where[patch.ROWS] and stamp[y, x] == mark:
+            return True
+    return False
+
+
+@njit(cache=True)
+def _own(seen: Image, stamp: Image, where: Array, start: Indices) -> None:
+    """Mark the tiles that the grown region touches: nobody looks there again."""
+    mark, t = stamp[start[1], start[0]], tiles.TILE_PX
+    unit = int(where[patch.UNIT])
+    for y in range(int(where[patch.ROWS])):
+        top = int(where[patch.TOP]) + y * unit
+        for x in range(int(where[patch.COLUMNS])):
+            if stamp[y, x] == mark:
+                left = int(where[patch.LEFT]) + x * unit
+                for i in range(top // t, (top + unit - 1) // t + 1):
+                    for j in range(left // t, (left + unit - 1) // t + 1):
+                        if i < seen.shape[0] and j < seen.shape[1]:
+                            seen[i, j] = 1
+
+
+@njit(cache=True)
+def _own_plateau(
+    image: Image,
+    planes: int,
+    scale: float,
+    weight: Array,
+    v: int,
+    u: int,
+    reach: float,
+    q: Array,
+    window: Window,
+    where: Array,
+    start: Indices,
+    seen: Image,
+) -> None:
+    """Mark the tiles of what is too large to be a light, as far as it is as bright as here in its weakest plane."""
+    darkest, least = 0, 1e9
+    for p in range(planes):
+        mean = samples.core_mean(image, planes, scale, p, v, u)
+        if mean <= least:
+            darkest, least = p, mean
+    weight[:] = 0.0
+    weight[darkest] = 1.0
+    patch.cut(image, planes, scale, weight, v, u, reach, patch.COARSE_SIDE, window[0], where)
+    start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
+    window[1][:] = 0
+    patch.grow(window, where, image, start[0], start[1], LEVELS[-1] * least, q[fields.CLIPPED], 1)
+    _own(seen, window[1], where, start)

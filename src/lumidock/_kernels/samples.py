@@ -1,0 +1,147 @@
+"""Samples of a picture around a pixel, plane by plane, and how much each plane counts for a light there.
+
+Samples come as (H, W, C) of an unsigned type, 1 or 3 channels, or one channel that is a Bayer mosaic.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from lumidock.datatypes import Array, Image
+
+RING = 24  # samples on a ring
+COS, SIN = np.cos(np.arange(RING) * 2.0 * np.pi / RING), np.sin(np.arange(RING) * 2.0 * np.pi / RING)
+_ROOT_TWO = np.sqrt(2.0)
+_LEAST_LOST, _SLACK = 0.4, 0.5  # share of its height that a spot loses to the ring; sigmas of noise left to it
+
+
+@njit(cache=True)
+def sample(image: Image, planes: int, p: int, v: int, u: int) -> float:
+    """One sample of plane `p` at pixel or, on a mosaic, in the 2 x 2 cell of a pixel."""
+    if planes == 1:
+        return float(image[v, u, 0])
+    if planes == 3:
+        return float(image[v, u, p])
+    return float(image[min((v & -2) + (p >> 1), image.shape[0] - 1), min((u & -2) + (p & 1), image.shape[1] - 1), 0])
+
+
+@njit(cache=True)
+def core_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int) -> float:
+    """Mean of a plane over 3 x 3 of its samples around a pixel."""
+    pitch = 2 if planes == 4 else 1
+    total, count = 0.0, 0
+    for y in range(max(v - pitch, 0), min(v + pitch + 1, image.shape[0]), pitch):
+        for x in range(max(u - pitch, 0), min(u + pitch + 1, image.shape[1]), pitch):
+            total += sample(image, planes, p, y, x)
+            count += 1
+    return scale * total / count
+
+
+@njit(cache=True)
+def ring_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float) -> float:
+    """Mean of the second quarter of twelve samples of a plane on a circle around a pixel, 0 where it is outside.
+
+    So nearly half of the circle may lie on something brighter.
+    """
+    ordered, count = np.empty(12), 0
+    for k in range(0, RING, 2):
+        x, y = int(u + radius * COS[k] + 0.5), int(v + radius * SIN[k] + 0.5)
+        if 0 <= x < image.shape[1] and 0 <= y < image.shape[0]:
+            count = insert(ordered, count, sample(image, planes, p, y, x))
+    if count == 0:
+        return 0.0
+    return float(scale * ordered[count // 4 : count // 2 + 1].mean())
+
+
+@njit(cache=True)
+def stands_out(
+    image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float, noise: float, least: float
+) -> bool:
+    """Whether 3 x 3 samples clear a ring by `least` times its scatter or the noise: cheap enough for every candidate.
+
+    A halo falls off as the square of the distance, four times as far at twice the radius; a spot not larger than the
+    ring has lost half of its height there already.
+    """
+    level, spread, whole = _pair_level(image, planes, scale, p, v, u, radius)
+    if not whole:
+        return True
+    core = core_mean(image, planes, scale, p, v, u)
+    over = core - level
+    if over < least * max(noise, spread):
+        return False
+    far, _, whole = _pair_level(image, planes, scale, p, v, u, 2.0 * radius)
+    return not whole or over + _SLACK * noise >= _LEAST_LOST * (core - far)
+
+
+@njit(cache=True)
+def _pair_level(
+    image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float
+) -> tuple[float, float, bool]:
+    """Level and scatter of the means of opposite samples on a ring, which no slope moves; whether it is in view."""
+    means, count = np.empty(RING // 4), 0
+    for k in range(0, RING // 2, 2):
+        x, y = int(np.floor(radius * COS[k] + 0.5)), int(np.floor(radius * SIN[k] + 0.5))
+        if min(u - abs(x), v - abs(y)) < 0 or u + abs(x) >= image.shape[1] or v + abs(y) >= image.shape[0]:
+            return 0.0, 0.0, False
+        both = sample(image, planes, p, v + y, u + x) + sample(image, planes, p, v - y, u - x)
+        count = insert(means, count, 0.5 * scale * both)
+    return means[1:5].mean(), _ROOT_TWO * (means[4] - means[1]) / 1.35, True
+
+
+@njit(cache=True)
+def weigh(image: Image, planes: int, scale: float, v: int, u: int, radius: float, weight: Array) -> None:
+    """Write each plane's `weight` (4,), their sum 1, for a light of about `radius` px at a pixel.
+
+    Planes count by how far they stand out of a ring, as in the best filter for equal noise.
+    """
+    weight[:] = 0.0
+    if planes == 1:
+        weight[0] = 1.0
+        return
+    for p in range(planes):
+        dark = ring_mean(image, planes, scale, p, v, u, 3.0 * radius)
+        weight[p] = max(core_mean(image, planes, scale, p, v, u) - dark, 0.0)
+    total = weight.sum()
+    if total <= 0.0:
+        weight[:planes], total = 1.0, float(planes)
+    weight /= total
+
+
+@njit(cache=True)
+def weigh_clipped(
+    image: Image, planes: int, scale: float, v: int, u: int, least: float, largest: float, weight: Array
+) -> float:
+    """The same for a saturated light: only the planes in which it is smallest count. Returns its radius there, or 0.
+
+    A saturated core in its halo is small where its colour is weak: the red of a blue lamp. The radius is that of the
+    first ring at half height over the ring three times as wide; a plane must stand out by `least`.
+    """
+    weight[:] = 0.0
+    radii = np.full(4, np.inf)
+    for p in range(planes):
+        top, radius = core_mean(image, planes, scale, p, v, u), 3.0
+        while radius < largest:
+            dark = ring_mean(image, planes, scale, p, v, u, 3.0 * radius)
+            if top - dark >= least and ring_mean(image, planes, scale, p, v, u, radius) <= 0.5 * (top + dark):
+                radii[p] = radius
+                break
+            radius *= 1.25
+    smallest = radii.min()
+    if not np.isfinite(smallest):
+        return 0.0
+    for p in range(planes):
+        weight[p] = 1.0 if radii[p] <= 1.3 * smallest else 0.0
+    weight /= weight.sum()
+    return float(smallest)
+
+
+@njit(cache=True)
+def insert(ordered: Array, count: int, value: float) -> int:
+    """Insert into the first `count` of the sorted values; returns the new count."""
+    k = count
+    while k > 0 and ordered[k - 1] > value:
+        ordered[k] = ordered[k - 1]
+        k -= 1
+    ordered[k] = value
+    return count + 1
