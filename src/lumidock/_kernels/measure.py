@@ -47,8 +47,8 @@ def measure(
     else:
         radius = min(_extent(peak, i, j, level), q[fields.MAX_RADIUS_PX])
         sigma = noise * np.sqrt(shared_by_plane[p])
-        if radius < tiles.TILE_PX and not samples.stands_out(
-            image, planes, scale, p + (p == 2 and planes == 4), v, u, q[fields.RING_PX], sigma, _QUICK
+        if not samples.stands_out(
+            image, planes, scale, p + (p == 2 and planes == 4), v, u, max(radius, q[fields.RING_PX]), sigma, _QUICK
         ):
             return -1
         samples.weigh(image, planes, scale, v, u, radius, weight)

@@ -60,18 +60,17 @@ def stands_out(
 ) -> bool:
     """Whether 3 x 3 samples clear a ring by `least` times its scatter or the noise: cheap enough for every candidate.
 
-    A halo falls off as the square of the distance, four times as far at twice the radius; a spot not larger than the
-    ring has lost half of its height there already.
+    Nothing stands out that has lost too little on the ring of what it has lost at twice the radius: the top of a halo
+    falls off as the square of the distance, and a spot not larger than the ring has lost half of its height there.
     """
     level, spread, whole = _pair_level(image, planes, scale, p, v, u, radius)
     if not whole:
         return True
     core = core_mean(image, planes, scale, p, v, u)
-    over = core - level
-    if over < least * max(noise, spread):
+    if core - level < least * max(noise, spread):
         return False
     far, _, whole = _pair_level(image, planes, scale, p, v, u, 2.0 * radius)
-    return not whole or over + _SLACK * noise >= _LEAST_LOST * (core - far)
+    return not whole or core - level + _SLACK * noise >= _LEAST_LOST * (core - far)
 
 
 @njit(cache=True)

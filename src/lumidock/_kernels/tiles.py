@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from lumidock.datatypes import Array, Image, Indices
 
@@ -149,7 +150,7 @@ def revisit(rows: Image, planes: int, rects: Indices, peak: Image, line: Image) 
 
 
 @njit(cache=True)
-def _noise(even: Image, odd: Image, planes: int, difference: Indices, sigma: Array, by_plane: Array) -> None:
+def _noise(even: Image, odd: Image, planes: int, difference: NDArray[np.int32], sigma: Array, by_plane: Array) -> None:
     """The noise of one row of blocks, from an even and, of a mosaic, an odd row of pixels, see `survey`.
 
     `difference` (2, W * channels) is scratch: second differences of either row.
@@ -176,7 +177,7 @@ def _noise(even: Image, odd: Image, planes: int, difference: Indices, sigma: Arr
 
 
 @njit(cache=True)
-def _second_differences(row: Image, step: int, out: Indices) -> None:
+def _second_differences(row: Image, step: int, out: NDArray[np.int32]) -> None:
     """Absolute second differences of samples `step` apart."""
     n = max(len(row) - 2 * step, 0)
     a, b, c, d = row[:n], row[step : n + step], row[2 * step :], out[:n]
@@ -185,7 +186,7 @@ def _second_differences(row: Image, step: int, out: Indices) -> None:
 
 
 @njit(cache=True)
-def _mean(values: Indices, first: int, last: int, step: int) -> float:
+def _mean(values: NDArray[np.int32], first: int, last: int, step: int) -> float:
     """Mean of every so many of `values`, 0 where there are none."""
     part = values[first : max(last, first)]
     total = 0
