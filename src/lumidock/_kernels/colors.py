@@ -7,7 +7,7 @@ from numba import njit
 
 from lumidock.datatypes import Array, Image, Indices
 
-_SAMPLES = 24  # a side of a window at most
+_SAMPLES = 16  # a side of a window at most
 _CLIP_ROUNDS, _CLIP = 2, 2.5  # outliers of the background, in sigmas
 
 
@@ -36,6 +36,7 @@ def colors(
     pitch = 2 if planes == 4 else 1
     value = np.empty(4)
     rim = np.empty((3, (_SAMPLES + 4) ** 2))
+    total, count = np.empty(3), np.empty(3)
     for n in range(len(uv)):
         u, v = uv[n]
         outer = ring[0] * radius[n] + ring[1]
@@ -45,25 +46,18 @@ def colors(
         burnt = _is_burnt(image, scale, clipped, u, v, inner)
         low, high = (radius[n] + clear_px, outer) if burnt else (0.0, inner)
         fine = max(step // 2 // pitch * pitch, pitch) if high < 8.0 else step
-        total, count, dark = np.zeros(3), np.zeros(3), 0
-        for y in range(
-            max(int(v - high), 0) // pitch * pitch, min(int(v + high) + 2, image.shape[0] - pitch + 1), fine
-        ):
-            for x in range(
-                max(int(u - high), 0) // pitch * pitch, min(int(u + high) + 2, image.shape[1] - pitch + 1), fine
-            ):
-                distance = np.hypot(x + 0.5 * (pitch - 1) - u, y + 0.5 * (pitch - 1) - v)
-                if low <= distance <= high and _read(image, planes, scale, y, x, value) < clipped:
+        total[:], count[:], dark = 0.0, 0.0, 0
+        center_u, center_v = u - 0.5 * (pitch - 1), v - 0.5 * (pitch - 1)
+        for y in _steps(v, high, image.shape[0], pitch, fine):
+            for x in _steps(u, high, image.shape[1], pitch, fine):
+                square = (x - center_u) ** 2 + (y - center_v) ** 2
+                if low * low <= square <= high * high and _read(image, planes, scale, y, x, value) < clipped:
                     for p in range(planes):
                         total[order[p]] += _light(value[p], linear)
                         count[order[p]] += 1.0
-        for y in range(
-            max(int(v - reach), 0) // pitch * pitch, min(int(v + reach) + 2, image.shape[0] - pitch + 1), step
-        ):
-            for x in range(
-                max(int(u - reach), 0) // pitch * pitch, min(int(u + reach) + 2, image.shape[1] - pitch + 1), step
-            ):
-                if np.hypot(x - u, y - v) > 1.5 * outer and dark < rim.shape[1]:
+        for y in _steps(v, reach, image.shape[0], pitch, step):
+            for x in _steps(u, reach, image.shape[1], pitch, step):
+                if (x - u) ** 2 + (y - v) ** 2 > 2.25 * outer * outer and dark < rim.shape[1]:
                     _read(image, planes, scale, y, x, value)
                     for p in range(planes):
                         rim[order[p], dark] = _light(value[p], linear)
@@ -75,6 +69,12 @@ def colors(
             level, spread = _clipped_moments(rim[c, :dark])
             signal[n, c] = total[c] / count[c] - level
             sigma[n, c] = spread / np.sqrt(count[c]) + 1e-3
+
+
+@njit(cache=True)
+def _steps(center: float, reach: float, size: int, pitch: int, step: int) -> range:
+    """Rows or columns around a place, as far as they are in the picture."""
+    return range(max(int(center - reach), 0) // pitch * pitch, min(int(center + reach) + 2, size - pitch + 1), step)
 
 
 @njit(cache=True)
@@ -97,7 +97,7 @@ def _is_burnt(image: Image, scale: float, clipped: float, u: float, v: float, re
     step = 1 + int(reach) // 8
     for y in range(max(int(v - reach), 0), min(int(v + reach) + 2, image.shape[0]), step):
         for x in range(max(int(u - reach), 0), min(int(u + reach) + 2, image.shape[1]), step):
-            if np.hypot(x - u, y - v) <= reach:
+            if (x - u) ** 2 + (y - v) ** 2 <= reach * reach:
                 for p in range(image.shape[2]):
                     if scale * image[y, x, p] >= clipped:
                         return True
@@ -107,13 +107,14 @@ def _is_burnt(image: Image, scale: float, clipped: float, u: float, v: float, re
 @njit(cache=True)
 def _clipped_moments(values: Array) -> tuple[float, float]:
     """Mean and standard deviation without outliers."""
-    level, spread = values.mean(), values.std()
-    for _ in range(_CLIP_ROUNDS):
+    level, spread = 0.0, np.inf
+    for _ in range(_CLIP_ROUNDS + 1):
         total, squares, count = 0.0, 0.0, 0
         for x in values:
-            if abs(x - level) <= _CLIP * spread:
-                total += x - level
-                squares += (x - level) ** 2
+            d = x - level
+            if abs(d) <= _CLIP * spread:
+                total += d
+                squares += d * d
                 count += 1
         if count == 0:
             break

@@ -66,7 +66,7 @@ def search(
         if seen[i, j]:
             continue
         p = int(found[k, 4])
-        v, u, is_peak = _peak_pixel(image, planes, p, i, j)
+        v, u, is_peak = _peak_pixel(image, planes, p, i, j, peak[p, i, j] >= clipped)
         if not is_peak or seen[v // tiles.TILE_PX, u // tiles.TILE_PX]:
             continue
         noise = max(scale * sigma[i // tiles.BLOCK, j // tiles.BLOCK], q[fields.MIN_NOISE])
@@ -125,7 +125,7 @@ def _brightest(image: Image, planes: int, p: int, i: int, j: int) -> tuple[int, 
 
 
 @njit(cache=True)
-def _peak_pixel(image: Image, planes: int, p: int, i: int, j: int) -> tuple[int, int, bool]:
+def _peak_pixel(image: Image, planes: int, p: int, i: int, j: int, saturated: bool) -> tuple[int, int, bool]:
     """Row and column of a tile's brightest pixel of a map, on a plateau of its middle.
 
     And whether it is a peak: none next to it, beyond the tile, is brighter.
@@ -136,21 +136,24 @@ def _peak_pixel(image: Image, planes: int, p: int, i: int, j: int) -> tuple[int,
         for u in range(max(column - reach, 0), min(column + reach + 1, image.shape[1])):
             if _rank(image, planes, p, v, u) > best:
                 return row, column, False
+    farthest = 64 if saturated else tiles.TILE_PX
     for _ in range(2):
-        row = _middle_of_run(image, planes, p, row, column, 1, 0, best)
-        column = _middle_of_run(image, planes, p, row, column, 0, 1, best)
+        row = _middle_of_run(image, planes, p, row, column, 1, 0, best, farthest)
+        column = _middle_of_run(image, planes, p, row, column, 0, 1, best, farthest)
     return row, column, best > 0
 
 
 @njit(cache=True)
-def _middle_of_run(image: Image, planes: int, p: int, v: int, u: int, dv: int, du: int, rank: int) -> int:
+def _middle_of_run(
+    image: Image, planes: int, p: int, v: int, u: int, dv: int, du: int, rank: int, farthest: int
+) -> int:
     """Row or column in the middle of the run of pixels of at least this rank through a pixel, along one of both."""
     pitch = 2 if planes == 4 else 1
     ends = [0, 0]
     for side in range(2):
         sign = 1 if side else -1
         k = pitch
-        while k < 64 * pitch:
+        while k < farthest * pitch:
             y, x = v + sign * dv * k, u + sign * du * k
             if not (0 <= y < image.shape[0] and 0 <= x < image.shape[1]) or _rank(image, planes, p, y, x) < rank:
                 break

@@ -336,7 +336,7 @@ def candidates(
             if not worth[j] or seen[i, j] or count == len(found):
                 continue
             here = spread * sigma[b, j // BLOCK]
-            if not _stands_out(peak, i, j, int(1.5 * contrast * here), int(clipped)):
+            if not _stands_out(peak, i, j, max(int(1.5 * contrast * here), 2), int(clipped)):
                 continue
             seen[i, j] = 1
             found[count, 0], found[count, 1] = i, j
@@ -376,7 +376,12 @@ def _stands_out(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
     near = over_pairs(peak, i, j, 1)
     if near < 0:
         return False
-    return twice >= 2 * clipped or near >= margin or over_pairs(peak, i, j, _FAR) >= margin
+    if twice >= 2 * clipped or near >= margin:
+        return True
+    for d in range(2, _FAR):  # the top of a wide light, and not every bump on its flanks
+        if over_pairs(peak, i, j, d) < 0:
+            return False
+    return over_pairs(peak, i, j, _FAR) >= margin
 
 
 @njit(cache=True)
