@@ -78,17 +78,13 @@ class Scan:
 
         The whole frame where windows would be a good part of it.
         """
-        seen = np.column_stack([self.last[:, :2], 2.0 * self.last[:, 2] + _DRIFT_PX])
-        u, v, reach = np.concatenate([expected, seen]).T / tiles.TILE_PX
-        h, w = self.peak.shape[1:]
-        rects = np.empty((len(u) + 1, 4), np.int64)
-        rects[:-1, 0], rects[:-1, 1] = np.clip(v - reach, 0, h), np.clip(v + reach + 1.0, 0, h)
-        rects[:-1, 2], rects[:-1, 3] = np.clip(u - reach, 0, w), np.clip(u + reach + 1.0, 0, w)
-        rows = len(self.sigma)
+        rows, (h, w) = len(self.sigma), self.peak.shape[1:]
         first, last = self.part * rows // SWEEP, (self.part + 1) * rows // SWEEP
-        rects[-1] = first * tiles.BLOCK, min(last * tiles.BLOCK, h), 0, w
-        area = ((rects[:-1, 1] - rects[:-1, 0]) * (rects[:-1, 3] - rects[:-1, 2])).sum()
-        return rects if area < _MOST_WINDOWS * h * w else self.whole
+        rects = np.empty((len(expected) + len(self.last) + 1, 4), np.int64)
+        count = tiles.windows(expected, self.last, _DRIFT_PX, h, w, rects)
+        rects[count] = first * tiles.BLOCK, min(last * tiles.BLOCK, h), 0, w
+        rects = rects[: count + 1]
+        return rects if tiles.area(rects) < _MOST_WINDOWS * h * w else self.whole
 
 
 def _parameters(config: DetectConfig, longer_side: int, least_noise: float) -> Array:

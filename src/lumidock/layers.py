@@ -23,6 +23,8 @@ def label(frame: Frame, detections: Detections, config: LabelConfig) -> Detectio
     """
     mosaic = frame.encoding.startswith("bayer")
     if not len(detections) or (frame.image.ndim == 2 and not mosaic):
+        if np.isnan(detections.p_rear).all():
+            return detections
         return replace(detections, p_rear=np.full(len(detections), np.nan))
     signal, sigma = np.empty((len(detections), 3)), np.empty((len(detections), 3))
     image = frame.image[:, :, None] if mosaic else frame.image

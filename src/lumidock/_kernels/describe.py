@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lumidock._kernels import fields, gauss, patch
+from lumidock._kernels import fields, gauss, patch, samples
 from lumidock._kernels.patch import Window
 from lumidock.datatypes import Array, Image, Indices
 
@@ -34,48 +34,33 @@ def describe(
 ) -> bool:
     """Fill `spots[n]` from the grown region; False for what is too faint, or a spot that is there already."""
     spot, sums = spots[n], window[3]
-    floor, noise = ground[0], ground[1]
     top = window[0][start[1], start[0]]
-    level = floor + share * (top - floor)
-    unit = where[patch.UNIT]
-    area = sums[patch.N]
-    radius = np.sqrt(area / np.pi) * unit
-    spot[fields.HALO] = _around(window[0], where, start, sums, 2.0, floor) / max(top - floor, 1e-6)
-    flux = sums[patch.W] + area * (level - floor)
-    snr = flux / (area * np.sqrt(shared * noise**2 / area + ground[2] ** 2))
-    if radius < _FILTERED_PX:
-        x, y = start[0] + sums[patch.X] / area, start[1] + sums[patch.Y] / area
-        snr = small_snr(window[0], where, x, y, max(FILTER_PX / unit, 0.7), ground, shared)
-    if snr < q[fields.MIN_SNR]:
+    level = ground[0] + share * (top - ground[0])
+    _size(window, where, start, ground, level, shared, spot)
+    if spot[fields.SNR] < q[fields.MIN_SNR] or _is_known(spots, n):
         return False
-    pitch = 2.0 if planes == 4 else 1.0
-    spot[fields.RADIUS], spot[fields.FLUX], spot[fields.SNR], spot[fields.LEVEL] = (
-        radius,
-        flux * unit * unit,
-        snr,
-        share,
-    )
-    spot[fields.ELONGATION], spot[fields.FILL] = patch.shape(sums)
-    spot[fields.SATURATED], spot[fields.CUT] = sums[patch.CLIPPED] / area, sums[patch.EDGE] / area
-    spread = _unresolved(sums, q, unit)
-    slope_u, slope_v = where[patch.SLOPE_U], where[patch.SLOPE_V]
-    skew_u, skew_v = _skew(image, window, where, start, level + 0.5 * (top - level), q, unit)
-    if unit > pitch:  # again, as finely as the room allows
+    spot[fields.LEVEL] = share
+    radius, noise = spot[fields.RADIUS], ground[1]
+    merged = _unresolved(sums, q, where[patch.UNIT])
+    slope = (where[patch.SLOPE_U], where[patch.SLOPE_V]) if planes < 4 else (0.0, 0.0)
+    if where[patch.UNIT] > (2.0 if planes == 4 else 1.0):  # again, as finely as the room allows
         patch.cut(image, planes, scale, weight, v, u, 1.6 * radius + 3.0, patch.SIDE, window[0], where)
-        unit = where[patch.UNIT]
         start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
         peak_value(window[0], where, start)
         patch.grow(window, where, image, start[0], start[1], level, q[fields.CLIPPED], _FINE_MARK)
-        area = sums[patch.N]
     center, cov = np.empty(2), np.empty(3)
-    variance = noise**2 + q[fields.SIGNAL_NOISE] * max(sums[patch.W] / area, 0.0)
+    variance = noise**2 + q[fields.SIGNAL_NOISE] * max(sums[patch.W] / sums[patch.N], 0.0)
+    unit = where[patch.UNIT]
     patch.balance(sums, variance * shared, center, cov)
-    cov *= unit * unit
-    shift_u, shift_v = _plane_shift(weight, planes, spot[fields.SATURATED] > 0.0)
+    shift_u, shift_v = _plane_shift(image, planes, scale, weight, window, where, start, level)
     center[0] = where[patch.LEFT] + unit * (start[0] + center[0]) + shift_u
     center[1] = where[patch.TOP] + unit * (start[1] + center[1]) + shift_v
-    fitted = False
-    slope = (slope_u, slope_v) if planes < 4 else (0.0, 0.0)
+    skew_u, skew_v = _skew(image, window, where, start, level + 0.5 * (top - level), q, unit)
+    cov[0], cov[1], cov[2] = (
+        unit * unit * cov[0] + skew_u * skew_u,
+        unit * unit * cov[1] + skew_u * skew_v,
+        unit * unit * cov[2] + skew_v * skew_v,
+    )
     if radius <= q[fields.SMALL_PX] * (1.6 if planes == 4 else 1.0) and sums[patch.EDGE] == 0.0:
         sample_noise = noise if planes < 4 else max(noise / np.sqrt((weight**2).sum()), q[fields.MIN_NOISE])
         width = gauss.fit(
@@ -92,22 +77,47 @@ def describe(
             cov,
         )
         if width > 0.0:
-            fitted = True
+            merged = 0.0, 0.0, 0.0
             cov *= shared
             spot[fields.RADIUS] = 1.18 * width
     spot[fields.U], spot[fields.V] = center
-    coarse = planes == 3 and weight[1] < max(weight[0], weight[2])
-    floor_px = (q[fields.COARSE_PX] if coarse else q[fields.FLOOR_PX]) ** 2 + (
-        q[fields.SATURATED_PX] ** 2 if spot[fields.SATURATED] > 0.0 else 0.0
-    )
-    if sums[patch.EDGE] > 0.0:
-        floor_px += (q[fields.CUT_SHARE] * radius) ** 2
-    if not fitted:
-        spread = spread[0] + skew_u * skew_u, spread[1] + skew_u * skew_v, spread[2] + skew_v * skew_v
-    spot[fields.VAR_UU] = cov[0] + floor_px + spread[0]
-    spot[fields.VAR_UV] = cov[1] + spread[1]
-    spot[fields.VAR_VV] = cov[2] + floor_px + spread[2]
+    floor = _floor(planes, weight, spot, sums, q)
+    spot[fields.VAR_UU] = cov[0] + floor + merged[0]
+    spot[fields.VAR_UV] = cov[1] + merged[1]
+    spot[fields.VAR_VV] = cov[2] + floor + merged[2]
     return not _is_known(spots, n)
+
+
+@njit(cache=True)
+def _size(
+    window: Window, where: Array, start: Indices, ground: Array, level: float, shared: float, spot: Array
+) -> None:
+    """What the region grown at `level` says of a spot: all but its exact centre and covariance."""
+    sums, floor, noise, unit = window[3], ground[0], ground[1], where[patch.UNIT]
+    top, area = window[0][start[1], start[0]], sums[patch.N]
+    x, y = start[0] + sums[patch.X] / area, start[1] + sums[patch.Y] / area
+    spot[fields.U], spot[fields.V] = where[patch.LEFT] + unit * x, where[patch.TOP] + unit * y
+    spot[fields.RADIUS] = np.sqrt(area / np.pi) * unit
+    spot[fields.HALO] = _around(window[0], where, start, sums, 2.0, floor) / max(top - floor, 1e-6)
+    flux = sums[patch.W] + area * (level - floor)
+    spot[fields.FLUX] = flux * unit * unit
+    spot[fields.SNR] = flux / (area * np.sqrt(shared * noise**2 / area + ground[2] ** 2))
+    if spot[fields.RADIUS] < _FILTERED_PX:
+        spot[fields.SNR] = small_snr(window[0], where, x, y, max(FILTER_PX / unit, 0.7), ground, shared)
+    spot[fields.ELONGATION], spot[fields.FILL] = patch.shape(sums)
+    spot[fields.SATURATED], spot[fields.CUT] = sums[patch.CLIPPED] / area, sums[patch.EDGE] / area
+
+
+@njit(cache=True)
+def _floor(planes: int, weight: Array, spot: Array, sums: Array, q: Array) -> float:
+    """Variance of a centre that has no noise."""
+    coarse = planes == 3 and weight[1] < max(weight[0], weight[2])
+    variance = (q[fields.COARSE_PX] if coarse else q[fields.FLOOR_PX]) ** 2
+    if spot[fields.SATURATED] > 0.0:
+        variance += q[fields.SATURATED_PX] ** 2
+    if sums[patch.EDGE] > 0.0:
+        variance += (q[fields.CUT_SHARE] * spot[fields.RADIUS]) ** 2
+    return float(variance)
 
 
 @njit(cache=True)
@@ -151,14 +161,47 @@ def _around(part: Array, where: Array, start: Indices, sums: Array, radii: float
 
 
 @njit(cache=True)
-def _plane_shift(weight: Array, planes: int, clipped: bool) -> tuple[float, float]:
-    """Where the samples of a cell lie on the average: planes of a mosaic stand a pixel apart."""
+def _plane_shift(
+    image: Image, planes: int, scale: float, weight: Array, window: Window, where: Array, start: Indices, level: float
+) -> tuple[float, float]:
+    """Where the samples of a cell lie on the average: planes of a mosaic stand a pixel apart.
+
+    A plane counts by its share of what the region holds over the contour at `level`, which lies between the samples
+    inside that have a neighbour outside and the reverse. It follows from the derivative of the balance by a plane's
+    place.
+    """
     if planes != 4:
         return 0.0, 0.0
-    # a plane's weight goes with its share of the light, its part of the sum with the square; clipped, all are alike
-    part = weight if clipped else weight**2
-    total = part.sum()
-    return float((part[1] + part[3]) / total), float((part[2] + part[3]) / total)
+    stamp, mark, unit = window[1], window[1][start[1], start[0]], int(where[patch.UNIT])
+    total, rim, count = np.zeros((2, 5)), np.zeros((2, 5)), np.zeros((2, 2))  # outside, inside; planes and their mean
+    for i in range(1, int(where[patch.ROWS]) - 1):
+        y = int(where[patch.TOP]) + i * unit
+        for j in range(1, int(where[patch.COLUMNS]) - 1):
+            inside = int(stamp[i, j] == mark)
+            alike = (stamp[i - 1, j] == mark) + (stamp[i + 1, j] == mark)
+            alike += (stamp[i, j - 1] == mark) + (stamp[i, j + 1] == mark)
+            on_rim = alike < 4 if inside else alike > 0
+            if not (inside or on_rim):
+                continue
+            count[inside, 0] += 1.0
+            count[inside, 1] += on_rim
+            mixed = 0.0
+            for p in range(4):
+                value = scale * samples.sample(image, planes, p, y, int(where[patch.LEFT]) + j * unit)
+                mixed += weight[p] * value
+                total[inside, p] += value
+                rim[inside, p] += on_rim * value
+            rim[inside, 4] += on_rim * mixed
+    share = weight.copy()
+    if count[0, 1] > 0.0 and count[1, 1] > 0.0:
+        inner, outer = rim[1] / count[1, 1], rim[0] / count[0, 1]
+        part = min(max((inner[4] - level) / max(inner[4] - outer[4], 1e-6), 0.0), 1.0)
+        for p in range(4):
+            contour = inner[p] + part * (outer[p] - inner[p])
+            share[p] *= max(total[1, p] / count[1, 0] - contour, 0.0)
+    if share.sum() <= 0.0:
+        share[:] = weight
+    return float((share[1] + share[3]) / share.sum()), float((share[2] + share[3]) / share.sum())
 
 
 @njit(cache=True)

@@ -66,7 +66,7 @@ def fit(
             return 0.0
         u, v = u + dx, v + dy
         s = min(max(s + step[2], 0.7 * s), 1.4 * s)
-        if dx * dx + dy * dy < 1e-5 and turn > 0:
+        if dx * dx + dy * dy < 1e-4 and turn > 0:
             break
     if dx * dx + dy * dy > 1e-2 or np.hypot(u - center[0], v - center[1]) > width or not 0.4 < s < 2.0 * width:
         return 0.0

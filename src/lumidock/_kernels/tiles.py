@@ -150,6 +150,45 @@ def revisit(rows: Image, planes: int, rects: Indices, peak: Image, line: Image) 
 
 
 @njit(cache=True)
+def windows(expected: Array, seen: Array, drift_px: float, h: int, w: int, rects: Indices) -> int:
+    """Write the tiles, `rects` (n, 4), around the `expected` places (n, 3), u, v and reach px, and those `seen` last.
+
+    Of these u, v and radius; what lies in a window already gets none of its own. Returns how many there are.
+    """
+    count = 0
+    for k in range(len(expected) + len(seen)):
+        if k < len(expected):
+            u, v, reach = expected[k, 0], expected[k, 1], expected[k, 2]
+        else:
+            u, v = seen[k - len(expected), 0], seen[k - len(expected), 1]
+            reach = 2.0 * seen[k - len(expected), 2] + drift_px
+        top, bottom = _clip((v - reach) / TILE_PX, h), _clip((v + reach) / TILE_PX + 1.0, h)
+        left, right = _clip((u - reach) / TILE_PX, w), _clip((u + reach) / TILE_PX + 1.0, w)
+        known = top >= bottom or left >= right
+        for m in range(count):
+            r = rects[m]
+            known |= r[0] <= top and bottom <= r[1] and r[2] <= left and right <= r[3]
+        if not known:
+            rects[count, 0], rects[count, 1], rects[count, 2], rects[count, 3] = top, bottom, left, right
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _clip(x: float, most: int) -> int:
+    return int(min(max(x, 0.0), float(most)))
+
+
+@njit(cache=True)
+def area(rects: Indices) -> int:
+    """Tiles in all windows together, those in several counted as often."""
+    total = 0
+    for k in range(len(rects)):
+        total += (rects[k, 1] - rects[k, 0]) * (rects[k, 3] - rects[k, 2])
+    return total
+
+
+@njit(cache=True)
 def _noise(even: Image, odd: Image, planes: int, difference: NDArray[np.int32], sigma: Array, by_plane: Array) -> None:
     """The noise of one row of blocks, from an even and, of a mosaic, an odd row of pixels, see `survey`.
 
