@@ -147,9 +147,11 @@ class DetectConfig(Section):
     min_elongation: Fraction = 0.6  # shorter over longer axis of a round spot; below, its level is raised
     min_fill: Fraction = 0.85  # area over that of the ellipse with the same moments
     signal_noise: PositiveFloat = 0.01  # variance of a pixel per grey level of signal: shot noise, mosaic, JPEG
-    floor_px: PositiveFloat = 0.02  # 1 sigma of a centre that has no noise
+    linear_noise: PositiveFloat = 0.024  # the same of mosaics and of 16 bits, which no gamma bends: 255 over 10.7 ke-
+    texture: PositiveFloat = 1.0  # share of its radius by which texture as strong as a spot moves the centre, 1 sigma
+    floor_px: PositiveFloat = 0.012  # 1 sigma of a centre that has no noise
     coarse_px: PositiveFloat = 0.05  # the same where blue or red is brightest: JPEG has fewer samples of them
-    saturated_px: PositiveFloat = 0.03  # added to it, squared, where the core is saturated
+    saturated_px: PositiveFloat = 0.025  # added to it, squared, where the core is saturated
     cut: Fraction = 0.3  # 1 sigma, of the radius, of a centre whose spot the picture's edge cuts
     glint_radii: PositiveFloat = 3.6  # a spot this near, in radii of the stronger one, ...
     glint_ratio: PositiveFloat = 2.2  # ... with this many times less flux is a glint, ...

@@ -56,7 +56,7 @@ class Scan:
         self.whole = np.array([[0, h, 0, w]])
         self.shared = np.ones(4)
         self.least_noise = config.min_noise * (1.0 if dtype == np.uint8 else _TWELVE_BITS * _SIXTEEN)
-        self.q = _parameters(config, max(height, width), self.least_noise)
+        self.q = _parameters(config, max(height, width), self.least_noise, self.planes == 4 or dtype != np.uint8)
         self.swept, self.part = False, 0
         self.last = np.empty((0, 3))
 
@@ -87,14 +87,15 @@ class Scan:
         return rects if tiles.area(rects) < _MOST_WINDOWS * h * w else self.whole
 
 
-def _parameters(config: DetectConfig, longer_side: int, least_noise: float) -> Array:
+def _parameters(config: DetectConfig, longer_side: int, least_noise: float, linear: bool) -> Array:
     """The numbers that the kernel takes, in its order."""
     q = np.empty(fields.PARAMETERS)
     q[fields.CONTRAST], q[fields.MIN_SNR], q[fields.RING_PX] = config.contrast, config.min_snr, config.ring_px
     q[fields.MAX_RADIUS_PX] = max(config.max_radius * longer_side, 2.0 * config.ring_px)
     q[fields.MIN_RADIUS_PX], q[fields.SMALL_PX] = config.min_radius_px, config.small_px
     q[fields.MIN_ELONGATION], q[fields.MIN_FILL] = config.min_elongation, config.min_fill
-    q[fields.SIGNAL_NOISE], q[fields.FLOOR_PX] = config.signal_noise, config.floor_px
+    q[fields.SIGNAL_NOISE] = config.linear_noise if linear else config.signal_noise
+    q[fields.FLOOR_PX], q[fields.TEXTURE] = config.floor_px, config.texture
     q[fields.SATURATED_PX], q[fields.CUT_SHARE] = config.saturated_px, config.cut
     q[fields.GLINT_RADII], q[fields.GLINT_RATIO] = config.glint_radii, config.glint_ratio
     q[fields.GLINT_TRUST], q[fields.CLIPPED], q[fields.MIN_NOISE] = config.glint_trust, _SATURATED, least_noise

@@ -55,7 +55,11 @@ def describe(
     shift_u, shift_v = _plane_shift(image, planes, scale, weight, window, where, start, level)
     center[0] = where[patch.LEFT] + unit * (start[0] + center[0]) + shift_u
     center[1] = where[patch.TOP] + unit * (start[1] + center[1]) + shift_v
-    skew_u, skew_v = _skew(image, window, where, start, level + 0.5 * (top - level), q, unit)
+    higher = level + 0.5 * (top - level)
+    skew_u, skew_v = _skew(image, window, where, start, higher, q, unit)
+    if skew_u != 0.0 or skew_v != 0.0:
+        other_u, other_v = _plane_shift(image, planes, scale, weight, window, where, start, higher)
+        skew_u, skew_v = skew_u + other_u - shift_u, skew_v + other_v - shift_v
     cov[0], cov[1], cov[2] = (
         unit * unit * cov[0] + skew_u * skew_u,
         unit * unit * cov[1] + skew_u * skew_v,
@@ -81,7 +85,7 @@ def describe(
             cov *= shared
             spot[fields.RADIUS] = 1.18 * width
     spot[fields.U], spot[fields.V] = center
-    floor = _floor(planes, weight, spot, sums, q)
+    floor = _floor(planes, weight, spot, sums, q) + (q[fields.TEXTURE] * ground[3] * radius / (top - ground[0])) ** 2
     spot[fields.VAR_UU] = cov[0] + floor + merged[0]
     spot[fields.VAR_UV] = cov[1] + merged[1]
     spot[fields.VAR_VV] = cov[2] + floor + merged[2]

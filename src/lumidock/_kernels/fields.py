@@ -33,5 +33,6 @@ COLUMNS = 16
     RANGE,
     PROMINENT,
     COARSE_PX,
-) = range(22)
-PARAMETERS = 22
+    TEXTURE,
+) = range(23)
+PARAMETERS = 23

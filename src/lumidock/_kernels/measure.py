@@ -55,14 +55,15 @@ def measure(
     shared = (weight**2 * shared_by_plane).sum() / (weight**2).sum()
     expected = noise * np.sqrt((weight**2).sum())
     reach = min(max(3.5 * radius, 1.5 * q[fields.RING_PX]), 3.5 * q[fields.MAX_RADIUS_PX])
-    part, ground = 0.0, np.zeros(3)  # level, noise and texture of the surroundings
+    part, ground = 0.0, np.zeros(4)  # of the surroundings: level, noise, texture that hides a spot, texture at all
     for turn in range(_ROUNDS):
         patch.cut(image, planes, scale, weight, v, u, reach, patch.COARSE_SIDE, window[0], where)
         start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
         ring = 0.9 * reach / where[patch.UNIT]
         ground[0], spread = patch.flatten(window[0], where, float(start[0]), float(start[1]), ring)
         ground[1] = max(patch.rim_noise(window[0], where), 0.5 * expected, q[fields.MIN_NOISE] * expected / noise)
-        ground[2] = 0.0 if clipped else np.sqrt(max(spread**2 - 2.0 * ground[1] ** 2, 0.0))
+        ground[3] = np.sqrt(max(spread**2 - 2.0 * ground[1] ** 2, 0.0))
+        ground[2] = 0.0 if clipped else ground[3]
         if turn == 0 and not clipped:
             width = max(FILTER_PX / where[patch.UNIT], 0.7)
             if (
