@@ -11,6 +11,7 @@ from lumidock.datatypes import Array, Image, Indices
 
 FILTER_PX = 1.2  # width of the window that judges a small spot ...
 _FILTERED_PX = 3.0  # ... up to this radius
+_GRID, _GRID_OF_MOSAIC = 0.015, 0.05  # 1 sigma, of a sample's side, that the grid of samples leaves to a balance
 _FINE_MARK, _SKEW_MARK = 100, 101  # of regions grown again, beside those of the levels tried
 
 
@@ -60,6 +61,7 @@ def describe(
     if skew_u != 0.0 or skew_v != 0.0:
         other_u, other_v = _plane_shift(image, planes, scale, weight, window, where, start, higher)
         skew_u, skew_v = skew_u + other_u - shift_u, skew_v + other_v - shift_v
+    noise_of_balance = unit * unit * (cov[0] + cov[2] + 2.0 * (_GRID_OF_MOSAIC if planes == 4 else _GRID) ** 2)
     cov[0], cov[1], cov[2] = (
         unit * unit * cov[0] + skew_u * skew_u,
         unit * unit * cov[1] + skew_u * skew_v,
@@ -67,6 +69,7 @@ def describe(
     )
     if radius <= q[fields.SMALL_PX] * (1.6 if planes == 4 else 1.0) and sums[patch.EDGE] == 0.0:
         sample_noise = noise if planes < 4 else max(noise / np.sqrt((weight**2).sum()), q[fields.MIN_NOISE])
+        balanced = center[0], center[1]
         width = gauss.fit(
             image,
             planes,
@@ -81,7 +84,7 @@ def describe(
             cov,
         )
         if width > 0.0:
-            merged = 0.0, 0.0, 0.0
+            merged = _disagreement(center[0] - balanced[0], center[1] - balanced[1], noise_of_balance)
             cov *= shared
             spot[fields.RADIUS] = 1.18 * width
     spot[fields.U], spot[fields.V] = center
@@ -222,6 +225,14 @@ def _skew(
         skew = unit * (sums[patch.WX] / sums[patch.W] - x), unit * (sums[patch.WY] / sums[patch.W] - y)
     sums[:] = kept
     return skew
+
+
+@njit(cache=True)
+def _disagreement(du: float, dv: float, expected: float) -> tuple[float, float, float]:
+    """Covariance by two estimates of a centre that differ by more than noise makes them: its profile is uneven."""
+    square = du * du + dv * dv
+    share = max(1.0 - expected / max(square, 1e-12), 0.0)
+    return share * du * du, share * du * dv, share * dv * dv
 
 
 @njit(cache=True)
