@@ -229,9 +229,9 @@ def _skew(
 
 @njit(cache=True)
 def _disagreement(du: float, dv: float, expected: float) -> tuple[float, float, float]:
-    """Covariance by two estimates of a centre that differ by more than noise makes them: its profile is uneven."""
+    """Covariance by two estimates of a centre, for what they differ beyond two sigma: its profile is uneven."""
     square = du * du + dv * dv
-    share = max(1.0 - expected / max(square, 1e-12), 0.0)
+    share = max(1.0 - 4.0 * expected / max(square, 1e-12), 0.0)
     return share * du * du, share * du * dv, share * dv * dv
 
 
