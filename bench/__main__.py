@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from bench import contact_sheet, detection, doors, images, rendering, reproduced, speed, table1, visibility
+from bench import contact_sheet, detection, doors, images, rendering, reproduced, speed, table1, visibility, waters
 
 BENCHES = {
     "doors": doors,
@@ -19,6 +19,7 @@ BENCHES = {
     "images": images,
     "speed": speed,
     "detection": detection,
+    "waters": waters,
     "visibility": visibility,
     "rendering": rendering,
     "reproduced": reproduced,

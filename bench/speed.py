@@ -13,7 +13,6 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,37 +22,30 @@ import numpy as np
 from bench.shipped import shipped_camera, shipped_station
 from lumidock import detect, layers
 from lumidock.config import Config
-from lumidock.datatypes import Frame, Image
+from lumidock.datatypes import Frame
 from lumidock.localizer import Localizer
 from lumidock.paper import PaperLocalizer
 from lumidock.streams.sources import open_source
 
 _Z_M, _ROUNDS, _SEED = (18.0, 9.0, 2.3), 7, 7100
-_KINDS = ("mono8", "bayer_rggb8", "bgr8")
+_OUTPUT = {
+    "mono8": ("output.pixels=mono8", "output.color=false", "output.file=png"),
+    "bayer_rggb8": ("output.pixels=bayer8", "output.file=png"),
+    "bgr8": (),
+}
 _OTHERS = np.zeros(1 << 26, np.uint8)
 Times = dict[str, list[float]]
 
 
-def sequence(z_m: float) -> list[Frame]:
-    """Some consecutive frames of the approach around a distance."""
+def sequence(z_m: float, kind: str) -> list[Frame]:
+    """Some consecutive frames of the approach around a distance, as a camera of this kind gives them."""
     with TemporaryDirectory() as name:
         command = [sys.executable, "-m", "lumidock", "sim", "approach", "--seed", str(_SEED), "--out", f"{name}/s"]
-        for setting in (f"path.start_z_m={z_m + 0.6}", f"path.end_z_m={z_m - 0.3}"):
+        settings = [f"path.start_z_m={z_m + 0.6}", f"path.end_z_m={z_m - 0.3}", *_OUTPUT[kind]]
+        for setting in settings:
             command += ["--set", setting]
         subprocess.run(command, check=True, capture_output=True)
         return [frame for frame in open_source(Path(name) / "s").items() if isinstance(frame, Frame)]
-
-
-def as_kind(frame: Frame, kind: str) -> Frame:
-    """The frame as another camera would give it."""
-    bgr = frame.image
-    if kind == "bgr8":
-        return frame
-    if kind == "mono8":
-        return replace(frame, image=np.ascontiguousarray(bgr[:, :, 1]))
-    raw: Image = bgr[:, :, 1].copy()
-    raw[0::2, 0::2], raw[1::2, 1::2] = bgr[0::2, 0::2, 2], bgr[1::2, 1::2, 0]
-    return replace(frame, image=raw, encoding=kind)
 
 
 def timed(times: Times, name: str, job: Callable[[], object]) -> None:
@@ -152,7 +144,7 @@ def start_up(frame: Frame) -> tuple[float, float, float]:
 def main() -> tuple[dict[str, object], list[str]]:
     """Medians over rounds in turns: a row a job, a column a distance."""
     cv2.setNumThreads(1)
-    frames = {(z, kind): [as_kind(f, kind) for f in sequence(z)] for z in _Z_M for kind in _KINDS}
+    frames = {(z, kind): sequence(z, kind) for z in _Z_M for kind in _OUTPUT}
     times: dict[tuple[float, str], Times] = defaultdict(lambda: defaultdict(list))
     for turn in range(_ROUNDS + 1):
         if turn == 1:  # the first one compiled
@@ -171,7 +163,7 @@ def main() -> tuple[dict[str, object], list[str]]:
     one_pass = float(np.median([x for (_, kind), t in times.items() if kind == "mono8" for x in t["np.max over it"]]))
     lines = ["| ms (passes) | " + " | ".join(f"{z:g} m" for z in _Z_M) + " |", "|---|" + "---|" * len(_Z_M)]
     content: dict[str, object] = {"pass_ms": one_pass}
-    for kind in _KINDS:
+    for kind in _OUTPUT:
         for job in sorted({job for z in _Z_M for job in times[z, kind]}):
             medians = [float(np.median(times[z, kind][job])) if times[z, kind][job] else float("nan") for z in _Z_M]
             content[f"{kind}: {job}"] = medians

@@ -47,9 +47,8 @@ def measure(
     else:
         radius = min(_extent(peak, i, j, level), q[fields.MAX_RADIUS_PX])
         sigma = noise * np.sqrt(shared_by_plane[p])
-        if not samples.stands_out(
-            image, planes, scale, p + (p == 2 and planes == 4), v, u, max(radius, q[fields.RING_PX]), sigma, _QUICK
-        ):
+        plane, small, ring = p + (p == 2 and planes == 4), radius < tiles.TILE_PX, max(radius, q[fields.RING_PX])
+        if not samples.stands_out(image, planes, scale, plane, v, u, ring, sigma, _QUICK, small):
             return -1
         samples.weigh(image, planes, scale, v, u, radius, weight)
     shared = (weight**2 * shared_by_plane).sum() / (weight**2).sum()

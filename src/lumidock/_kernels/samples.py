@@ -56,10 +56,20 @@ def ring_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int, r
 
 @njit(cache=True)
 def stands_out(
-    image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float, noise: float, least: float
+    image: Image,
+    planes: int,
+    scale: float,
+    p: int,
+    v: int,
+    u: int,
+    radius: float,
+    noise: float,
+    least: float,
+    small: bool,
 ) -> bool:
-    """Whether 3 x 3 samples clear a ring by `least` times its scatter or the noise: cheap enough for every candidate.
+    """Whether 3 x 3 samples clear a ring by `least` times the noise: cheap enough for every candidate.
 
+    A `small` spot's ring holds nothing of it, so that its scatter counts as noise as well.
     Nothing stands out that has lost too little on the ring of what it has lost at twice the radius: the top of a halo
     falls off as the square of the distance, and a spot not larger than the ring has lost half of its height there.
     """
@@ -67,7 +77,7 @@ def stands_out(
     if not whole:
         return True
     core = core_mean(image, planes, scale, p, v, u)
-    if core - level < least * max(noise, spread):
+    if core - level < least * max(noise, spread if small else 0.0):
         return False
     far, _, whole = _pair_level(image, planes, scale, p, v, u, 2.0 * radius)
     return not whole or core - level + _SLACK * noise >= _LEAST_LOST * (core - far)
