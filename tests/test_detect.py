@@ -265,6 +265,50 @@ def test_every_format_gives_the_same_lights(kind, rng):
 
 
 @pytest.mark.parametrize("order", MOSAICS)
+@pytest.mark.parametrize("sigma", [3.0, 6.0, 10.0])
+def test_a_saturated_light_of_a_mosaic_is_not_shifted_by_its_planes(order, sigma, rng):
+    letters = np.array(list(order.removeprefix("bayer_"))).reshape(2, 2)
+    gain = np.select([letters == "g", letters == "b"], [1.0, 0.45], 0.3)
+    errors = []
+    for _ in range(8):
+        image, place = canvas(rng, (240, 320)), rng.uniform(110.0, 130.0, 2)
+        light = np.zeros_like(image)
+        add_spot(light, *place, peak=900.0, sigma=sigma)
+        frame = Frame("f", 7, to_picture(image + light * np.tile(gain, (120, 160))), encoding=f"{order}8")
+        spots = detect.lights(frame, CONFIG)
+        errors.append(spots.uv[np.linalg.norm(spots.uv - place, axis=1).argmin()] - place)
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.05
+    assert np.sqrt(np.mean(np.square(errors))) < 0.08
+
+
+def test_a_glint_in_the_flank_of_a_small_light_widens_its_covariance_toward_it(rng):
+    sigmas = []
+    for glint in (0.0, 45.0):
+        image = canvas(rng)
+        add_spot(image, 150.2, 120.4, peak=150.0, sigma=1.8)
+        add_spot(image, 154.7, 120.4, peak=glint, sigma=1.2)
+        spots = found(image)
+        sigmas.append(np.sqrt(np.diag(spots.cov_px2[np.linalg.norm(spots.uv - (150.2, 120.4), axis=1).argmin()])))
+    alone, beside = sigmas
+    assert beside[0] > 2.0 * alone[0]
+    assert beside[0] > beside[1]
+
+
+def test_texture_around_a_light_widens_its_covariance(rng):
+    sigmas = []
+    for texture in (0.0, 40.0):
+        image = canvas(rng)
+        rows, columns = np.mgrid[0:240, 0:320]
+        image += (
+            texture * (np.sin(columns / 5.0) * np.sin(rows / 6.0) + 1.0) * (np.hypot(columns - 150, rows - 120) > 18)
+        )
+        add_disc(image, 150.3, 120.6, 6.0)
+        spots = found(image)
+        sigmas.append(np.sqrt(spots.cov_px2[np.linalg.norm(spots.uv - (150.3, 120.6), axis=1).argmin(), 0, 0]))
+    assert sigmas[1] > 1.5 * sigmas[0]
+
+
+@pytest.mark.parametrize("order", MOSAICS)
 def test_a_mosaic_tells_blue_from_white(order, rng):
     image = canvas(rng, (240, 320))
     letters = np.array(list(order.removeprefix("bayer_"))).reshape(2, 2)
