@@ -19,7 +19,7 @@ from mcap.writer import Writer as McapWriter
 from numpy.testing import assert_array_equal
 
 from lumidock.camera import Camera
-from lumidock.datatypes import Frame, Unusable
+from lumidock.datatypes import MOSAICS, Frame, Unusable
 from lumidock.errors import InputError, LumidockError
 from lumidock.streams.inspection import inspect
 from lumidock.streams.sources import open_source
@@ -27,6 +27,9 @@ from lumidock.streams.sources import open_source
 CAMERA = Camera(8, 6, np.array([[10.0, 0, 3], [0, 11.0, 2], [0, 0, 1]]), "plumb_bob", np.array([0.1, 0, 0, 0.01, 0]))
 MONO = np.random.default_rng(5).integers(0, 256, (6, 6, 8), np.uint8)
 COLOR = np.random.default_rng(6).integers(0, 256, (6, 8, 3), np.uint8)
+DEEP, DEEP_COLOR = (
+    np.random.default_rng(7).integers(0, 65536, shape, np.uint16) for shape in (MONO.shape, COLOR.shape)
+)
 TOPIC, SECOND = "/front/image_raw", 10**9
 
 
@@ -86,15 +89,17 @@ def test_pictures_stamps_and_calibration_come_out_of_a_bag(tmp_path, kind, compr
 
 ENCODINGS = {
     "mono8": (MONO[0], MONO[0]),
-    "mono16": (MONO[0].astype(np.uint16) * 256 + 91, MONO[0]),
+    "mono16": (DEEP[0], DEEP[0]),
     "bgr8": (COLOR, COLOR),
     "rgb8": (COLOR[..., ::-1], COLOR),
     "bgra8": (np.dstack([COLOR, MONO[0]]), COLOR),
     "rgba8": (np.dstack([COLOR[..., ::-1], MONO[0]]), COLOR),
-    "bgr16": (COLOR.astype(np.uint16) * 256 + 91, COLOR),
-    "rgb16": (COLOR[..., ::-1].astype(np.uint16) * 256 + 91, COLOR),
+    "bgr16": (DEEP_COLOR, DEEP_COLOR),
+    "rgb16": (DEEP_COLOR[..., ::-1], DEEP_COLOR),
     "8UC1": (MONO[0], MONO[0]),
-    "16UC1": (MONO[0].astype(np.uint16) * 256, MONO[0]),
+    "16UC1": (DEEP[0], DEEP[0]),
+    **{f"{mosaic}8": (MONO[0], MONO[0]) for mosaic in MOSAICS},
+    **{f"{mosaic}16": (DEEP[0], DEEP[0]) for mosaic in MOSAICS},
 }
 
 
@@ -109,25 +114,36 @@ def test_an_encoding_is_read(tmp_path, kind, encoding):
         (TOPIC, 3, bags.raw(3, swapped, encoding, big=True)),
     ]
     for item in open_source(make(tmp_path, kind, messages)).items():
+        assert item.image.dtype == wanted.dtype
         assert_array_equal(item.image, wanted)
+        assert item.encoding == (encoding if encoding.startswith("bayer") else "")
 
 
-@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-@pytest.mark.parametrize("wide", [False, True])
-def test_a_bayer_mosaic_becomes_its_colors(tmp_path, pattern, wide):
-    color = {"r": 200, "g": 120, "b": 40}
-    mosaic = np.empty((12, 16), np.uint16 if wide else np.uint8)
-    for place, letter in enumerate(pattern):
-        mosaic[place // 2 :: 2, place % 2 :: 2] = color[letter] << (8 if wide else 0)
-    encoding = f"bayer_{pattern}{16 if wide else 8}"
-    (item,) = open_source(make(tmp_path, "mcap", [(TOPIC, 1, bags.raw(1, mosaic, encoding))])).items()
-    assert_array_equal(item.image, np.broadcast_to([40, 120, 200], (12, 16, 3)))
+@pytest.mark.parametrize("encoding", ["mono16", "bayer_grbg16"])
+def test_twelve_bits_in_sixteen_get_their_full_scale(tmp_path, encoding):
+    pixels = np.array([[0, 1, 2048, 4095], [4096, 65535, 100, 7]], np.uint16)  # more than twelve bits are white
+    wanted = [[0, 16, 32768, 65520], [65520, 65520, 1600, 112]]
+    (item,) = open_source(make(tmp_path, "mcap", [(TOPIC, 1, bags.raw(1, pixels, encoding))]), bits=12).items()
+    assert_array_equal(item.image, wanted)
+    cv2.imwrite(str(tmp_path / "0.png"), pixels)
+    (item,) = open_source(tmp_path, 1.0, bits=12).items() if encoding == "mono16" else (item,)
+    assert_array_equal(item.image, wanted)
 
 
-def test_twelve_bits_in_sixteen_keep_their_brightness(tmp_path):
-    path = make(tmp_path, "mcap", [(TOPIC, 1, bags.raw(1, MONO[0].astype(np.uint16) << 4, "mono16"))])
-    (item,) = open_source(path, bits=12).items()
+@pytest.mark.parametrize(
+    ("form", "encoding"),
+    [
+        ("bayer_grbg8; png compressed ", "bayer_grbg8"),
+        ("bayer_grbg8; png compressed mono8", ""),
+        ("bayer_grbg; png compressed", ""),
+        ("png", ""),
+    ],
+)
+def test_a_mosaic_compressed_as_it_is_stays_one(tmp_path, form, encoding):
+    png = cv2.imencode(".png", MONO[0])[1].tobytes()
+    (item,) = open_source(make(tmp_path, "mcap", [(TOPIC, 1, bags.compressed(1, png, form))])).items()
     assert_array_equal(item.image, MONO[0])
+    assert item.encoding == encoding
 
 
 def test_compressed_pictures_are_read_and_bad_ones_told(tmp_path):
@@ -326,7 +342,7 @@ def test_inspection_counts_gaps_drops_and_sizes(tmp_path):
     source = open_source(make(tmp_path, "mcap", messages))
     result = inspect(source, Camera(9, 6, CAMERA.K))
     assert result["frames"] == 8
-    assert result["sizes"] == [{"width": 8, "height": 6, "kind": "mono", "frames": 8}]
+    assert result["sizes"] == [{"width": 8, "height": 6, "encoding": "mono8", "frames": 8}]
     assert result["calibration"]["frames_of_another_size"] == 8
     time = result["time"]
     assert (time["gaps"], time["drops"], time["out_of_order"]) == (2, 3, 1)

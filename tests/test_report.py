@@ -207,7 +207,7 @@ def test_what_others_wrote_stays_text(docking, tmp_path):
     described = json.loads((run_folder / "run.json").read_text())
     described["lumidock"] = described["method"] = described["source"]["kind"] = evil
     described["config"] = {evil: evil}
-    described["inputs_sha256"][evil] = evil
+    described["inputs_sha256"][evil] = described["inputs_sampled"][evil] = evil
     (run_folder / "run.json").write_text(json.dumps(described))
     station = (run_folder / "station.yaml").read_text()
     (run_folder / "station.yaml").write_text(re.sub(r"(?m)^name: .*$", "name: '<script>alert(2)</script>'", station))
@@ -241,7 +241,7 @@ def test_wrong_source_no_run_and_too_many_are_refused(docking, tmp_path, lumidoc
 
 
 def test_damaged_description_is_one_line(docking, tmp_path):
-    for content in ("", "[]", "{", '{"source": 3}', '{"inputs_sha256": []}'):
+    for content in ("", "[]", "{", '{"source": 3}', '{"inputs_sha256": []}', '{"inputs_sampled": true}'):
         broken = tmp_path / f"{len(content)}" / "run"
         shutil.copytree(docking, broken)
         (broken / "run.json").write_text(content)

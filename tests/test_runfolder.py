@@ -2,6 +2,7 @@ import csv
 import hashlib
 import json
 import resource
+import time
 from collections import deque
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,7 +13,7 @@ from conftest import assert_close
 
 from lumidock.datatypes import Detections, Fix, Guide, LayerPose, Match, Protection
 from lumidock.geometry import pose_from_quat
-from lumidock.streams.runfolder import RunFolder, sha256
+from lumidock.streams.runfolder import RunFolder, identities, sha256
 
 COLUMNS = (
     "frame,t_ns,valid,guide,status,stage,n_seen,n_used,x_m,y_m,z_m,qx,qy,qz,qw,"
@@ -245,3 +246,28 @@ def test_the_description_is_replaced_in_one_piece(tmp_path):
 def test_the_hash_is_sha256(tmp_path):
     (tmp_path / "file").write_bytes(b"lumidock")
     assert sha256(tmp_path / "file") == hashlib.sha256(b"lumidock").hexdigest()
+
+
+def test_a_large_file_is_told_by_its_size_and_samples(tmp_path, rng):
+    size, path = (16 << 20) + 1, tmp_path / "dive.mcap"
+    path.write_bytes(rng.bytes(size))
+    (tmp_path / "small").write_bytes(b"lumidock")
+    found = identities({"dive.mcap": path, "small": tmp_path / "small"})
+    assert found["inputs_sha256"] == {"small": sha256(tmp_path / "small")}
+    assert found["inputs_sampled"]["dive.mcap"]["bytes"] == size
+    digests = {found["inputs_sampled"]["dive.mcap"]["sha256_of_samples"]}
+    for at in (0, 65535, size - 65536, size - 1):  # the first block and the last
+        content = bytearray(path.read_bytes())
+        content[at] ^= 1
+        path.write_bytes(content)
+        digests.add(identities({"dive.mcap": path})["inputs_sampled"]["dive.mcap"]["sha256_of_samples"])
+    assert len(digests) == 5
+
+
+def test_identifying_a_huge_file_takes_no_time(tmp_path):
+    path = tmp_path / "huge.mcap"
+    with path.open("wb") as file:
+        file.truncate(50 << 30)  # 50 GiB of nothing, which take no room
+    start = time.monotonic()
+    assert identities({"huge.mcap": path})["inputs_sampled"]["huge.mcap"]["bytes"] == 50 << 30
+    assert time.monotonic() - start < 5.0

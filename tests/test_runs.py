@@ -12,9 +12,10 @@ from lumidock.errors import InputError
 from lumidock.localizer import Localizer
 from lumidock.metrics import evaluate
 from lumidock.run import Setup, run
-from lumidock.runs import evaluate_all, find_runs, flat, write_table
+from lumidock.runs import described, evaluate_all, find_runs, flat, source_of, write_table
 from lumidock.sim.scenario import load_scenario
 from lumidock.sim.sequence import write_detections
+from lumidock.streams import runfolder
 from lumidock.streams.runfolder import RunFolder
 from lumidock.streams.sources import open_source
 
@@ -83,3 +84,18 @@ def test_no_run_no_truth_and_other_endings_are_one_line(runs, tmp_path, lumidock
     for words in (("eval", lonely), ("eval", tmp_path / "absent"), ("eval", runs, "--out", tmp_path / "t.xlsx")):
         code, _, error = lumidock(*words)
         assert (code, len(error.strip().splitlines())) == (2, 1)
+
+
+def test_a_source_too_large_to_hash_is_known_by_its_samples(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr(runfolder, "_MOST_HASHED", 300)
+    monkeypatch.setattr(runfolder, "_SAMPLE", 200)
+    out, stamps = tmp_path / "run", runs / "sequence" / "timestamps.csv"
+    station, source = shipped_station(), open_source(runs / "sequence")
+    with RunFolder(out, station.ids) as folder:
+        run(source, Localizer(station, shipped_camera()), folder, Setup("lumidock", False, Config(), stamps, stamps))
+    assert "timestamps.csv" in described(out)["inputs_sampled"]
+    assert source_of(out, described(out), runs / "sequence").path == runs / "sequence"
+    other = shutil.copytree(runs / "sequence", tmp_path / "other")
+    (other / "timestamps.csv").write_text(stamps.read_text() + "\n")
+    with pytest.raises(InputError, match="not what"):
+        source_of(out, described(out), other)

@@ -13,6 +13,7 @@ import numpy as np
 from lumidock.camera import Camera
 from lumidock.datatypes import Fix, Frame, Image
 from lumidock.overlay import around_lights, draw, whole
+from lumidock.picture import developed
 from lumidock.station import Station
 from lumidock.streams.sources import Item
 
@@ -46,7 +47,8 @@ class Album:
         self.fixes.append(fix)
         if not isinstance(item, Frame):
             return
-        picture = draw(item.image, fix, self.station, self.camera, whole(item.image, _WIDTH))
+        image = developed(item)
+        picture = draw(image, fix, self.station, self.camera, whole(image, _WIDTH))
         if self._writer is None:
             codec = cv2.VideoWriter.fourcc(*"mp4v")
             self._writer = cv2.VideoWriter(str(self.video), codec, self.fps, (picture.shape[1], picture.shape[0]))
@@ -54,9 +56,9 @@ class Album:
         usable = [one.stage for one in self.fixes if _is_usable(one)]
         if not _is_usable(fix) or usable.count(fix.stage) > _PICTURE_OF_STAGE[fix.stage]:
             return
-        near = around_lights(item.image, fix, _WIDTH)
+        near = around_lights(image, fix, _WIDTH)
         slot = "search" if len(usable) == 1 else fix.stage  # the very first one ends the search
-        self.by_stage[slot] = draw(item.image, fix, self.station, self.camera, near)
+        self.by_stage[slot] = draw(image, fix, self.station, self.camera, near)
 
     def sheet(self) -> list[Image]:
         """One picture per stage, in the order of the approach; an even number of them."""

@@ -52,9 +52,8 @@ def around_lights(image: Image, fix: Fix, width: int) -> View:
 
 
 def draw(image: Image, fix: Fix, station: Station, camera: Camera, view: View) -> Image:
-    """A copy of a picture (H, W[, 3]), as `view` has it, with detections, names, reprojected lights and the pose."""
+    """A copy of an 8-bit picture (H, W[, 3]), as `view` has it, with detections, names, foreseen lights and pose."""
     window = image[view.v : view.v + view.height, view.u : view.u + view.width]
-    window = window if window.dtype == np.uint8 else (window >> 8).astype(np.uint8)
     size = (round(view.width * view.scale), round(view.height * view.scale))
     canvas = cv2.resize(window, size, interpolation=cv2.INTER_AREA if view.scale < 1 else cv2.INTER_LINEAR)
     canvas = cv2.cvtColor(canvas, cv2.COLOR_GRAY2BGR) if canvas.ndim == 2 else canvas

@@ -16,7 +16,7 @@ import numpy as np
 from lumidock.config import Config
 from lumidock.datatypes import Detections, Fix, Frame, Stage, Unusable
 from lumidock.errors import FrameError, InputError
-from lumidock.streams.runfolder import RunFolder, sha256
+from lumidock.streams.runfolder import RunFolder, identities
 from lumidock.streams.sources import Item, Source
 
 
@@ -154,6 +154,6 @@ def _identity(source: Source, setup: Setup) -> dict[str, Any]:
         "method": setup.method,
         "cold": setup.cold,
         "source": {"kind": source.kind, "name": source.path.name},
-        "inputs_sha256": {name: sha256(path) for name, path in inputs.items()},
+        **identities(inputs),
         "config": setup.config.model_dump(mode="json"),
     }

@@ -9,10 +9,10 @@ from typing import Any
 
 from lumidock.errors import InputError, extra
 from lumidock.metrics import evaluate
-from lumidock.streams.runfolder import sha256
+from lumidock.streams.runfolder import identities
 from lumidock.streams.sources import Source, open_source
 
-_PARTS = ("source", "inputs_sha256", "config", "counts")
+_PARTS = ("source", "inputs_sha256", "inputs_sampled", "config", "counts")
 _MOST_DEEP = 4  # folders below the given one in which runs are looked for
 
 
@@ -49,8 +49,10 @@ def source_of(folder: Path, description: Mapping[str, Any], given: Path | None =
 
 def _is_source(source: Source, description: Mapping[str, Any]) -> bool:
     """Whether the files that identify a source are those of the run."""
-    known = description.get("inputs_sha256", {})
-    return all(known.get(path.name, "") == sha256(path) for path in source.inputs)
+    found = identities({path.name: path for path in source.inputs})
+    return all(
+        description.get(part, {}).get(name) == value for part, values in found.items() for name, value in values.items()
+    )
 
 
 def find_runs(folder: Path) -> list[Path]:

@@ -13,6 +13,7 @@ from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Image, Unusable
 from lumidock.errors import InputError, extra
 from lumidock.overlay import draw, whole
+from lumidock.picture import developed
 from lumidock.station import Station
 from lumidock.streams.runfolder import RunFolder
 from lumidock.vehicle import Vehicle
@@ -111,9 +112,9 @@ class _AnnotatedVideo:
         """Draw one fix; frames without a picture leave the last one standing."""
         del latency_us
         if isinstance(item, Frame):
-            width = min(_WIDTH, item.image.shape[1])
-            view = whole(item.image, width)
-            picture = draw(item.image, fix, self.scene.station, self.scene.camera, view)
+            image = developed(item)
+            view = whole(image, min(_WIDTH, image.shape[1]))
+            picture = draw(image, fix, self.scene.station, self.scene.camera, view)
             self.video.add(np.asarray(picture, np.uint8), item.t_ns)
 
     def close(self) -> None:

@@ -8,7 +8,18 @@ from typing import Annotated, Any
 
 import typer
 
-from lumidock.cli.shared import AsJson, CameraOption, Fps, Topic, app, calibration_of, example, open_any, progress_bar
+from lumidock.cli.shared import (
+    AsJson,
+    Bits,
+    CameraOption,
+    Fps,
+    Topic,
+    app,
+    calibration_of,
+    example,
+    open_any,
+    progress_bar,
+)
 from lumidock.errors import extra
 
 _OF_A_CAMERA = 100  # frames, which has no end
@@ -23,6 +34,7 @@ def _inspect(
     ],
     camera: CameraOption = None,
     topic: Topic = None,
+    bits: Bits = 16,
     fps: Fps = None,
     frames: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="Look at so many frames; 100 of a camera.")
@@ -32,7 +44,7 @@ def _inspect(
     """Show sizes, rates, gaps and exposure of SOURCE."""
     from lumidock.streams.inspection import inspect
 
-    opened = open_any(source, fps, topic=topic)
+    opened = open_any(source, fps, topic=topic, bits=bits)
     most = frames or (_OF_A_CAMERA if opened.live else None)
     known = camera is not None or opened.camera is not None or opened.calibration is not None
     with progress_bar("inspect") as progress:
@@ -52,7 +64,7 @@ def _print(result: dict[str, Any]) -> None:
         print(f"topic       {topic['name']}  {topic['type']}  {topic['messages']} messages")
     print(f"frames      {result['frames']} ({result['kind']})")
     for size in result["sizes"]:
-        print(f"size        {size['width']} x {size['height']} {size['kind']}, {size['frames']} frames")
+        print(f"size        {size['width']} x {size['height']} {size['encoding']}, {size['frames']} frames")
     if result["unusable"]:
         words = ", ".join(f"{word} {count}" for word, count in result["unusable"].items())
         print(f"unusable    {words}; first: {result['first_problem']}")

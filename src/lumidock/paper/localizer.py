@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from lumidock.camera import Camera
@@ -12,6 +14,7 @@ from lumidock.paper import extract
 from lumidock.paper.guidance import Guidance
 from lumidock.paper.layer import MIN_FOR_SWARM, LayerAnswer, LayerLocalizer
 from lumidock.paper.layers import LayerDiscriminator, label_by_color
+from lumidock.picture import developed
 from lumidock.station import Station
 
 _MIN_SPREAD = 0.05  # of a layer's lights across their line, as a share of along it
@@ -39,13 +42,12 @@ class PaperLocalizer:
         self._last_t_ns: int | None = None
 
     def process(self, frame: Frame) -> Fix:
-        """Image door. Raises: FrameError when the image is not of the camera's size, or neither mono8 nor bgr8."""
+        """Image door; takes 8 bits of any frame. Raises: FrameError when the image is not of the camera's size."""
         height, width = frame.image.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             wanted = f"{self.camera.width}x{self.camera.height}"
             raise FrameError("bad_frame", f"frame {frame.name} is {width}x{height}, the calibration {wanted}")
-        if frame.image.dtype != np.uint8 or frame.encoding.startswith("bayer"):
-            raise FrameError("bad_frame", f"frame {frame.name}: the paper's method takes mono8 and bgr8 only")
+        frame = replace(frame, image=developed(frame), encoding="")
         detections = extract.lights(frame, self.config.extract)
         return self.process_detections(label_by_color(frame, detections, self.config.layers))
 

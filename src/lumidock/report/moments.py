@@ -12,6 +12,7 @@ import numpy as np
 from lumidock.datatypes import Array, Detections, Fix, Frame, Image, Match
 from lumidock.overlay import View, around_lights, whole
 from lumidock.page import Mark, Picture
+from lumidock.picture import developed
 from lumidock.pose import project_lights
 from lumidock.report.view import RunView
 from lumidock.station import Station
@@ -31,7 +32,7 @@ def pictures(view: RunView, most: int) -> list[Picture]:
     if view.source is None or view.source.kind == "detections" or not most:
         return []
     wanted = dict(sorted(_moments(view)[:most]))
-    return [_picture(view, view.fixes[k], item.image, title) for k, title, item in _items(view, wanted)]
+    return [_picture(view, view.fixes[k], developed(item), title) for k, title, item in _items(view, wanted)]
 
 
 def _items(view: RunView, wanted: dict[int, str]) -> Iterator[tuple[int, str, Frame]]:

@@ -144,6 +144,7 @@ def versions(view: RunView) -> list[Table | Listing]:
         ["station", f"{view.station.name}, {len(view.station.ids)} lights in {', '.join(view.station.layers)}"],
         ["camera", f"{view.camera.width} x {view.camera.height} px"],
         *([name, f"sha256 {digest}"] for name, digest in d.get("inputs_sha256", {}).items()),
+        *([name, _sampled(seen)] for name, seen in d.get("inputs_sampled", {}).items()),
         ["settings that differ", _different(d.get("config", {}))],
         ["this page", f"Python {platform.python_version()}, OpenCV {cv2.__version__}, numpy {np.__version__}"],
     ]
@@ -151,6 +152,11 @@ def versions(view: RunView) -> list[Table | Listing]:
     settings = yaml.safe_dump(d.get("config", {}), sort_keys=False, allow_unicode=True)
     counts = json.dumps(d.get("counts", {}), indent=1)
     return [table, Listing("All settings of the run", settings), Listing("Counts as run.json has them", counts)]
+
+
+def _sampled(seen: Any) -> str:  # noqa: ANN401  # what a file says, which others may have written
+    size, digest = (seen.get(part) for part in ("bytes", "sha256_of_samples")) if isinstance(seen, dict) else ("?", "?")
+    return f"{size} bytes, sha256 {digest} of samples"
 
 
 def _different(config: dict[str, Any]) -> str:

@@ -113,7 +113,7 @@ def _items(path: Path, topic: str, bits: int) -> Iterator[Item]:
             yield Unusable(name, None, "bad_frame", message.text)
             continue
         try:
-            t_ns, image = picture_of(message, bits=bits)
-            yield Frame(name, t_ns, image)
+            t_ns, image, encoding = picture_of(message, bits=bits)
+            yield Frame(name, t_ns, image, encoding=encoding)
         except FrameError as error:
             yield Unusable(name, message.log_ns, error.reason, str(error))

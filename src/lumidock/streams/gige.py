@@ -13,17 +13,19 @@ from lumidock.streams.pixels import unpack
 from lumidock.streams.sources import Item
 
 _BUFFERS, _TIMEOUT_US, _LOST_AFTER = 4, 1_000_000, 5  # of these waits without a frame
-_ENCODINGS = {
-    "Mono8": "mono8",
-    "Mono16": "mono16",
-    "RGB8": "rgb8",
-    "RGB8Packed": "rgb8",
-    "BGR8": "bgr8",
-    "BGR8Packed": "bgr8",
-    "BayerRG8": "bayer_rggb8",
-    "BayerBG8": "bayer_bggr8",
-    "BayerGB8": "bayer_gbrg8",
-    "BayerGR8": "bayer_grbg8",
+_COLORS = {"RGB8": "rgb8", "RGB8Packed": "rgb8", "BGR8": "bgr8", "BGR8Packed": "bgr8"}
+_SENSORS = {
+    "Mono": "mono",
+    "BayerRG": "bayer_rggb",
+    "BayerBG": "bayer_bggr",
+    "BayerGB": "bayer_gbrg",
+    "BayerGR": "bayer_grbg",
+}
+# encoding and how many bits count; 10 and 12 lie in the lower ones of 16
+_FORMATS = {name: (encoding, 8) for name, encoding in _COLORS.items()} | {
+    f"{name}{bits}": (f"{encoding}{8 if bits == 8 else 16}", bits)
+    for name, encoding in _SENSORS.items()
+    for bits in (8, 10, 12, 14, 16)
 }
 
 
@@ -35,15 +37,15 @@ def frames_of(name: str) -> Iterator[Item]:
     aravis, errors = _aravis()
     try:
         camera = aravis.Camera.new(name or None)
-        encoding = _ENCODINGS.get(camera.get_pixel_format_as_string())
-        if encoding is None:
+        pixels = _FORMATS.get(camera.get_pixel_format_as_string())
+        if pixels is None:
             raise InputError(f"gige:{name}: pixel format {camera.get_pixel_format_as_string()} is not supported")
         stream = _stream_of(aravis, camera)
         for _ in range(_BUFFERS):
             stream.push_buffer(aravis.Buffer.new_allocate(camera.get_payload()))
         camera.start_acquisition()
         try:
-            yield from _frames(aravis, stream, encoding, name)
+            yield from _frames(aravis, stream, pixels, name)
         finally:
             camera.stop_acquisition()
     except errors as error:
@@ -73,7 +75,7 @@ def _aravis() -> tuple[Any, type[Exception]]:
     return Aravis, GLib.Error
 
 
-def _frames(aravis: Any, stream: Any, encoding: str, name: str) -> Iterator[Item]:  # noqa: ANN401
+def _frames(aravis: Any, stream: Any, pixels: tuple[str, int], name: str) -> Iterator[Item]:  # noqa: ANN401
     number = waits = 0
     while True:
         buffer = stream.timeout_pop_buffer(_TIMEOUT_US)
@@ -87,18 +89,20 @@ def _frames(aravis: Any, stream: Any, encoding: str, name: str) -> Iterator[Item
         while newer is not None:
             stream.push_buffer(buffer)
             buffer, newer = newer, stream.try_pop_buffer()
-        yield _item(aravis, buffer, encoding, f"{number:06d}")
+        yield _item(aravis, buffer, pixels, f"{number:06d}")
         stream.push_buffer(buffer)
         number += 1
 
 
-def _item(aravis: Any, buffer: Any, encoding: str, name: str) -> Item:  # noqa: ANN401
+def _item(aravis: Any, buffer: Any, pixels: tuple[str, int], name: str) -> Item:  # noqa: ANN401
     t_ns = int(buffer.get_system_timestamp())
     if buffer.get_status() != aravis.BufferStatus.SUCCESS:
         return Unusable(name, t_ns, "bad_frame", f"frame {name}: {buffer.get_status().value_nick}")
     width, height = buffer.get_image_width(), buffer.get_image_height()
     data = np.frombuffer(buffer.get_data(), np.uint8)
     try:
-        return Frame(name, t_ns, unpack(data, encoding, (width, height), len(data) // max(height, 1)).copy())
+        step = len(data) // max(height, 1)
+        image, encoding = unpack(data, pixels[0], (width, height), step, bits=pixels[1])
+        return Frame(name, t_ns, image.copy(), encoding=encoding)
     except FrameError as error:
         return Unusable(name, t_ns, error.reason, f"frame {name}: {error}")

@@ -59,6 +59,13 @@ def decode_image(data: bytes, path: object, encoding: str = "") -> Image:
     return mono_if_gray(np.asarray(image))
 
 
+def full_scale(image: Image, bits: int) -> Image:
+    """A picture whose 16-bit pixels have `bits` that count, stretched to 16; what is beyond them is white."""
+    if image.dtype != np.uint16 or bits == 16:
+        return image
+    return np.left_shift(np.minimum(image, np.uint16((1 << bits) - 1)), np.uint16(16 - bits))
+
+
 def mono_if_gray(image: Image, *, tint: int = 0) -> Image:
     """A picture (H, W, 3) as (H, W) when its channels differ by at most `tint`: a mono camera's, saved as colour."""
     if image.ndim == 3 and _is_gray(image[::16, ::16], tint) and _is_gray(image, tint):

@@ -12,10 +12,11 @@ import numpy as np
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Frame, Unusable
+from lumidock.picture import encoding_of
 from lumidock.streams.sources import Source
 
 _GAP = 1.5  # an interval of that many median ones has lost a frame
-_SATURATED, _SPARSE = 250, 8  # grey level; every eighth pixel of every eighth row is looked at
+_SATURATED, _SPARSE = 250, 7  # of 255; every so many pixels and rows, odd to meet every colour of a mosaic
 
 
 @dataclass(slots=True)
@@ -30,8 +31,9 @@ class _Seen:
 
     def add(self, frame: Frame) -> None:
         height, width = frame.image.shape[:2]
-        self.sizes[width, height, "mono" if frame.image.ndim == 2 else "color"] += 1
+        self.sizes[width, height, encoding_of(frame)] += 1
         sparse = frame.image[::_SPARSE, ::_SPARSE]
+        sparse = sparse if sparse.dtype == np.uint8 else sparse >> 8
         self.median_level.append(float(np.median(sparse)))
         self.saturated.append(float((sparse >= _SATURATED).mean()))
 
@@ -61,8 +63,8 @@ def inspect(
         "unusable": dict(seen.unusable),
         "first_problem": seen.first_problem,
         "sizes": [
-            {"width": width, "height": height, "kind": kind, "frames": count}
-            for (width, height, kind), count in seen.sizes.most_common()
+            {"width": width, "height": height, "encoding": encoding, "frames": count}
+            for (width, height, encoding), count in seen.sizes.most_common()
         ],
         "calibration": _fit(seen, camera),
         "time": intervals(seen.t_ns),

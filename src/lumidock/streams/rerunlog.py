@@ -46,7 +46,7 @@ class RerunLog:
         else:
             self._stream.set_time("elapsed", duration=np.timedelta64(item.t_ns, "ns"))
         if isinstance(item, Frame):
-            picture = rr.EncodedImage(contents=jpeg_of(item.image), media_type="image/jpeg")
+            picture = rr.EncodedImage(contents=jpeg_of(item), media_type="image/jpeg")
             self._stream.log("dock/camera/image", picture)
         self._log_detections(fix)
         self._log_pose(fix)

@@ -13,9 +13,9 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from lumidock.camera import Camera, camera_from
-from lumidock.datatypes import Image
+from lumidock.datatypes import ENCODINGS, Image
 from lumidock.errors import FrameError, InputError
-from lumidock.streams.images import decode_image
+from lumidock.streams.images import decode_image, full_scale
 from lumidock.streams.pixels import unpack
 
 IMAGE, COMPRESSED, CAMERA_INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
@@ -60,21 +60,29 @@ def ros2_type(name: str) -> str:
     return name if "/msg/" in name else name.replace("/", "/msg/", 1)
 
 
-def picture_of(message: Message, *, bits: int = 16) -> tuple[int, Image]:
-    """Exposure time ns, or where that is zero the time of recording, and picture, mono8 or bgr8, of a message.
+def picture_of(message: Message, *, bits: int = 16) -> tuple[int, Image, str]:
+    """Exposure time ns, or where that is zero the time of recording, picture and a mosaic's encoding, of a message.
 
-    16-bit pixels keep the upper 8 of their `bits`. Raises: FrameError, one line.
+    16-bit pixels, of which the lower `bits` count, get their full scale. Raises: FrameError, one line.
     """
     content = _deserialize(message)
     t_ns = _stamp_ns(content.header.stamp) or message.log_ns
     try:
         if message.type == COMPRESSED:
-            return t_ns, decode_image(bytes(content.data), "compressed")
+            encoding = _mosaic_in(str(content.format))
+            return t_ns, full_scale(decode_image(bytes(content.data), "compressed", encoding), bits), encoding
         size, order = (int(content.width), int(content.height)), ">" if content.is_bigendian else "<"
         encoding, data = str(content.encoding), np.asarray(content.data, np.uint8)
-        return t_ns, unpack(data, encoding, size, int(content.step), order=order, bits=bits)
+        return t_ns, *unpack(data, encoding, size, int(content.step), order=order, bits=bits)
     except FrameError as error:
         raise FrameError(error.reason, f"{message.topic}: {error}") from None
+
+
+def _mosaic_in(form: str) -> str:
+    """The encoding of a mosaic that was compressed as it is: `bayer_rggb8; png compressed`, no colours after it."""
+    encoding, _, how = form.partition(";")
+    raw = encoding.startswith("bayer") and encoding in ENCODINGS and how.rstrip().endswith("compressed")
+    return encoding if raw else ""
 
 
 def stamp_of(message: Message) -> int:

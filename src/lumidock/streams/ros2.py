@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from lumidock.camera import Camera
-from lumidock.datatypes import Array, Detections, Fix, Frame, Image, Unusable
+from lumidock.datatypes import Array, Detections, Fix, Frame, Unusable
 from lumidock.geometry import quat_xyzw_from_rotation, se3_inverse
 from lumidock.streams.jpeg import jpeg_of
 from lumidock.vehicle import Vehicle
@@ -129,7 +129,7 @@ def messages(
         yield _serialized("/tf", t_ns, _make("tf2_msgs/msg/TFMessage", [transform]))
     if picture and isinstance(item, Frame):
         yield _serialized(f"{PREFIX}/camera_info", t_ns, _camera_info(camera, t_ns, frames))
-        yield _serialized(f"{PREFIX}/image/compressed", t_ns, _compressed(item.image, t_ns, frames))
+        yield _serialized(f"{PREFIX}/image/compressed", t_ns, _compressed(item, t_ns, frames))
         yield _serialized(f"{PREFIX}/annotations", t_ns, _annotations(fix, t_ns, light_ids))
 
 
@@ -217,8 +217,8 @@ def _camera_info(camera: Camera, t_ns: int, frames: _Frames) -> Any:  # noqa: AN
     )
 
 
-def _compressed(image: Image, t_ns: int, frames: _Frames) -> Any:  # noqa: ANN401
-    data = np.frombuffer(jpeg_of(image), np.uint8)
+def _compressed(frame: Frame, t_ns: int, frames: _Frames) -> Any:  # noqa: ANN401
+    data = np.frombuffer(jpeg_of(frame), np.uint8)
     return _make("sensor_msgs/msg/CompressedImage", _header(t_ns, frames.camera), "jpeg", data)
 
 

@@ -7,7 +7,7 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -31,6 +31,8 @@ FIX_COLUMNS = (
 LIGHT_COLUMNS = ("frame", "u_px", "v_px", "radius_px", "flux", "p_light", "p_rear", "light")
 LAYER_COLUMNS = ("frame", "layer", "n_used", "matched_by", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _FILES = ("fixes.csv", "lights.csv", "layers.csv", "trajectory.tum", "run.json")
+_MOST_HASHED = 1 << 24  # bytes; of a larger file only samples are
+_SAMPLES, _SAMPLE = 64, 1 << 16
 
 
 class RunFolder:
@@ -161,7 +163,33 @@ def _seconds(t_ns: int) -> str:
     return f"{'-' if t_ns < 0 else ''}{whole}.{part:09d}"
 
 
+def identities(files: Mapping[str, Path]) -> dict[str, dict[str, Any]]:
+    """What tells the inputs of a run from others, for run.json: `inputs_sha256` of whole files.
+
+    Of a file over 16 MiB, a recording of perhaps many GB, `inputs_sampled`: its size and the hash of 64 blocks spread
+    over it, the first and the last among them. It tells recordings apart; that every byte is the same it does not say.
+    """
+    whole, sampled = dict[str, Any](), dict[str, Any]()
+    for name, path in files.items():
+        size = path.stat().st_size
+        if size > _MOST_HASHED:
+            sampled[name] = {"bytes": size, "sha256_of_samples": sha256_of_samples(path, size)}
+        else:
+            whole[name] = sha256(path)
+    return {"inputs_sha256": whole, "inputs_sampled": sampled}
+
+
 def sha256(path: Path) -> str:
-    """Hash of a file's content, for run.json."""
+    """Hash of a file's content."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def sha256_of_samples(path: Path, size: int) -> str:
+    """Hash of 64 blocks of 64 KiB, evenly spread from the first to the last, of a file that is larger than them."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        for number in range(_SAMPLES):
+            file.seek((size - _SAMPLE) * number // (_SAMPLES - 1))
+            digest.update(file.read(_SAMPLE))
+    return digest.hexdigest()

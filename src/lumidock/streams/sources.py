@@ -15,7 +15,7 @@ from lumidock.camera import Camera
 from lumidock.datatypes import ENCODINGS, Array, Attitude, Detections, Frame, Unusable
 from lumidock.errors import FrameError, InputError, extra
 from lumidock.geometry import rotation_from_quat_xyzw
-from lumidock.streams.images import SUFFIXES, read_image
+from lumidock.streams.images import SUFFIXES, full_scale, read_image
 
 Item = Frame | Detections | Unusable
 _VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg", ".ts", ".wmv")
@@ -54,8 +54,8 @@ def open_source(
 ) -> Source:
     """Open a sequence folder, an image folder (needs `fps`), a video file or a bag of ROS 1 or ROS 2.
 
-    `topic` chooses the pictures of a bag, whose 16-bit pixels have `bits` that count; `gray` says that colour is not
-    needed. Raises: InputError, one line, when there is nothing to read.
+    `topic` chooses the pictures of a bag; 16-bit pixels have `bits` that count; `gray` says that colour is not needed.
+    Raises: InputError, one line, when there is nothing to read.
     """
     if fps is not None and not _FPS_RANGE[0] <= fps <= _FPS_RANGE[1]:
         raise InputError(f"--fps {fps:g}: wanted a frame rate from {_FPS_RANGE[0]:g} to {_FPS_RANGE[1]:g}")
@@ -66,7 +66,7 @@ def open_source(
             from lumidock.streams.bag import open_bag
         return open_bag(path, topic, bits)
     if path.is_dir():
-        return _open_folder(path, fps)
+        return _open_folder(path, fps, bits)
     if path.suffix.lower() in _VIDEO_SUFFIXES:
         with extra("video"):
             from lumidock.streams.video import open_video
@@ -82,19 +82,19 @@ def _holds_a_bag(folder: Path) -> bool:
     return any(file.suffix.lower() in BAG_SUFFIXES for file in folder.iterdir())
 
 
-def _open_folder(path: Path, fps: float | None) -> Source:
+def _open_folder(path: Path, fps: float | None, bits: int) -> Source:
     camera, station = (file if file.exists() else None for file in (path / "camera.yaml", path / "station.yaml"))
     if (path / "timestamps.csv").exists():
-        return _open_sequence(path, camera, station)
+        return _open_sequence(path, camera, station, bits)
     pictures = sorted((file for file in path.iterdir() if file.suffix.lower() in SUFFIXES), key=in_natural_order)
     if not pictures:
         raise InputError(f"{path}: neither timestamps.csv nor any PNG or JPEG in it")
     if fps is None:
         raise InputError(f"{path}: an image folder has no time stamps; give --fps")
-    return Source(path, "images", lambda: _pictures(pictures, fps), len(pictures), camera, station)
+    return Source(path, "images", lambda: _pictures(pictures, fps, bits), len(pictures), camera, station)
 
 
-def _open_sequence(path: Path, camera: Path | None, station: Path | None) -> Source:
+def _open_sequence(path: Path, camera: Path | None, station: Path | None, bits: int) -> Source:
     """A folder with timestamps.csv, and frames/ or detections.csv."""
     stamps, detections, attitude = path / "timestamps.csv", path / "detections.csv", path / "attitude.csv"
     rows = _read_stamps(stamps)
@@ -107,7 +107,7 @@ def _open_sequence(path: Path, camera: Path | None, station: Path | None) -> Sou
         return Source(
             path, "detections", lambda: _detections(rows, spots, attitudes), len(rows), camera, station, inputs
         )
-    return Source(path, "sequence", lambda: _sequence(path, rows, attitudes), len(rows), camera, station, inputs)
+    return Source(path, "sequence", lambda: _sequence(path, rows, attitudes, bits), len(rows), camera, station, inputs)
 
 
 def _read_csv(path: Path, columns: tuple[str, ...]) -> list[Row]:
@@ -192,7 +192,7 @@ def _in_order(rows: list[Row], read: Callable[[Row, int], Item]) -> Iterator[Ite
             yield Unusable(name, t_ns, error.reason, str(error))
 
 
-def _sequence(folder: Path, rows: list[Row], attitudes: _Attitudes) -> Iterator[Item]:
+def _sequence(folder: Path, rows: list[Row], attitudes: _Attitudes, bits: int) -> Iterator[Item]:
     def read(row: Row, t_ns: int) -> Item:
         encoding = (row.get("encoding") or "").strip()
         mosaic = encoding if encoding.startswith("bayer") else ""
@@ -200,7 +200,7 @@ def _sequence(folder: Path, rows: list[Row], attitudes: _Attitudes) -> Iterator[
             raise FrameError(
                 "bad_frame", f"frame {row['frame']}: encoding {encoding[:40]!r} is none of {', '.join(ENCODINGS)}"
             )
-        image = read_image(_inside(folder / "frames", row["file"]), mosaic)
+        image = full_scale(read_image(_inside(folder / "frames", row["file"]), mosaic), bits)
         return Frame(row["frame"], t_ns, image, attitudes.at(t_ns), mosaic)
 
     return _in_order(rows, read)
@@ -252,10 +252,10 @@ def in_natural_order(file: Path) -> list[str | int]:
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.name)]
 
 
-def _pictures(files: list[Path], fps: float) -> Iterator[Item]:
+def _pictures(files: list[Path], fps: float, bits: int) -> Iterator[Item]:
     for number, file in enumerate(files):
         t_ns = round(number * 1e9 / fps)
         try:
-            yield Frame(file.stem, t_ns, read_image(file))
+            yield Frame(file.stem, t_ns, full_scale(read_image(file), bits))
         except FrameError as error:
             yield Unusable(file.stem, t_ns, error.reason, str(error))
