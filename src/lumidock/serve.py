@@ -6,6 +6,7 @@ fix to the sinks, each of which has a thread and a short queue of its own, so th
 
 from __future__ import annotations
 
+import gc
 import os
 import threading
 import time
@@ -16,20 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from lumidock.camera import Camera as Lens
 from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import LumidockError
-from lumidock.pose import project_lights
 from lumidock.run import TwoDoors, process
 from lumidock.sinks import Sink
-from lumidock.station import Station
 from lumidock.streams.sources import Item
 
 _RECENT = 1000  # frames that rates and latencies are taken over
 _TICK_S = 0.2  # between looks at a sink that has nothing to do
 _RETRY_S = 1.0  # until a lost camera or a failed sink is tried again
 _CLOSING_S = 5.0  # a sink may take to write what is left
-_DRAWN_AT_M = 6.0
 _NICE = 10  # of viewers; on Linux a matter of each thread
 _LOOP_PAUSE_NS = 3_000_000_000  # between two passes over a recording: no track is carried across
 STALE_S = 0.25  # ArduPilot takes an estimate for lost after 0.3
@@ -249,6 +246,8 @@ class Server:
     def serve(self) -> None:
         """Localize the newest frame, over and over, until told to stop or the recording ends."""
         stage: Stage = "search"
+        gc.collect()
+        gc.freeze()  # what is alive now stays, and would be looked at in every long pause of the collector
         for worker in self.workers:
             worker.start()
         self.camera.start()
@@ -264,6 +263,7 @@ class Server:
             for worker in self.workers:
                 worker.finish()
             self.camera.join(_CLOSING_S)
+            gc.unfreeze()
 
     def _localize(self, taken: Taken, stage: Stage) -> Stage:
         fix, latency_us, _ = process(self.localizer, taken.item, stage)
@@ -309,18 +309,6 @@ class Server:
                 for worker in self.workers
             },
         }
-
-
-def warm_up(localizer: TwoDoors, station: Station, camera: Lens) -> None:
-    """Show a localizer, which is thrown away after, a drawn dock: what compiles at first use takes seconds."""
-    T_dock_cam = np.diag([1.0, -1.0, -1.0, 1.0])  # head-on
-    T_dock_cam[2, 3] = _DRAWN_AT_M
-    for number in range(3):
-        image = np.zeros((camera.height, camera.width, 3), np.uint8)
-        for u, v in project_lights(camera, T_dock_cam, station.p_dock):
-            if np.isfinite([u, v]).all() and camera.contains(np.array([[u, v]]))[0]:
-                image[max(int(v) - 1, 0) : int(v) + 2, max(int(u) - 1, 0) : int(u) + 2] = 220
-        process(localizer, Frame("drawn", number * 100_000_000, image), "search")
 
 
 def percentiles(values: list[float]) -> dict[str, float]:

@@ -307,13 +307,15 @@ def _seeds(text: str) -> tuple[int, int]:
 @app.command("warm", epilog=example("lumidock warm"))
 def _warm() -> None:
     """Compile ahead, so that no run waits for it."""
-    from lumidock.warm import steps
+    from lumidock.localizer import Localizer
+    from lumidock.warm import warm_up
 
     dock = load_station(shipped_or_path("station", DEFAULT_STATION))
     lens = load_camera(shipped_or_path("camera", DEFAULT_CAMERA))
-    for name in steps(dock, lens):
-        print(f"compiling for {name} ...", flush=True)
-    print("compiled; kept in numba's cache")
+    print("compiling ...", flush=True)
+    for name, _ in warm_up(Localizer(dock, lens).process, dock, lens):
+        print(f"compiled for {name}", flush=True)
+    print("kept in numba's cache")
 
 
 @app.command("demo", epilog=example("lumidock demo --force"))

@@ -39,10 +39,11 @@ from lumidock.cli.shared import (
 )
 from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
-from lumidock.serve import STALE_S, Camera, Newest, Server, Worker, warm_up
+from lumidock.serve import STALE_S, Camera, Newest, Server, Worker
 from lumidock.sinks import FILE_KINDS, Numbered, RunSink, Scene, open_rerun
 from lumidock.station import load_station
 from lumidock.vehicle import load_vehicle
+from lumidock.warm import warm_up
 
 _LOOPBACK, _ENDPOINT = "127.0.0.1", re.compile(r"(tcp|udp|tls|quic)/[^/?#]+:[0-9]{1,5}")
 _SWITCH_S = 5e-4  # a thread may hold the interpreter; the default lets the vehicle wait ten times longer
@@ -124,7 +125,7 @@ def _serve(
         lens = calibration_of(camera, opened)
         scene = Scene(dock, lens, load_vehicle(vehicle) if vehicle else None)
         settings = load_config(config) if config else Config()
-        warm_up(localizer_of(method, dock, lens, settings, cold=False), dock, lens)
+        list(warm_up(localizer_of(method, dock, lens, settings, cold=False).process, dock, lens))
         localizer = localizer_of(method, dock, lens, settings, cold=False)
         sinks = [
             *_vehicle_sinks(scene, mavlink, zenoh, domain if dds else None, domain, host),
