@@ -7,7 +7,6 @@ fix to the sinks, each of which has a thread and a short queue of its own, so th
 from __future__ import annotations
 
 import gc
-import os
 import threading
 import time
 from collections import Counter, deque
@@ -25,9 +24,10 @@ from lumidock.streams.sources import Item
 
 _RECENT = 1000  # frames that rates and latencies are taken over
 _TICK_S = 0.2  # between looks at a sink that has nothing to do
+_LOOK_S = 0.05  # that a recording waits at most for a picture to be looked at
 _RETRY_S = 1.0  # until a lost camera or a failed sink is tried again
+_AFTER_YOU_S = 0.01  # in which the vehicle is told, before what can wait takes the processor
 _CLOSING_S = 5.0  # a sink may take to write what is left
-_NICE = 10  # of viewers; on Linux a matter of each thread
 _LOOP_PAUSE_NS = 3_000_000_000  # between two passes over a recording: no track is carried across
 STALE_S = 0.25  # ArduPilot takes an estimate for lost after 0.3
 
@@ -46,6 +46,7 @@ class Newest:
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._taken: Taken | None = None
+        self._idle = threading.Event()
         self.dropped = 0
 
     def put(self, item: Item) -> None:
@@ -53,15 +54,21 @@ class Newest:
         with self._changed:
             self.dropped += self._taken is not None
             self._taken = Taken(item, time.monotonic())
+            self._idle.clear()
             self._changed.notify()
 
     def get(self, timeout_s: float) -> Taken | None:
         """Take the newest frame; None when none comes in time."""
         with self._changed:
             if self._taken is None:
+                self._idle.set()
                 self._changed.wait(timeout_s)
             taken, self._taken = self._taken, None
             return taken
+
+    def wait_until_idle(self, timeout_s: float) -> None:
+        """Wait until whoever takes the frames has done with the last one."""
+        self._idle.wait(timeout_s)
 
 
 class Camera(threading.Thread):
@@ -103,6 +110,9 @@ class Camera(threading.Thread):
             self.frames += 1
             self.problem = ""
             self._newest.put(_of_pass(item, self._passes, self._offset_ns))
+            if not self._live:  # a camera has no next picture to decode while this one is looked at
+                self._newest.wait_until_idle(_LOOK_S)
+                self._halt.wait(_AFTER_YOU_S)
         if self._loop and first_ns is not None:
             self._offset_ns += last_ns - first_ns + _LOOP_PAUSE_NS
             self._halt.wait(_LOOP_PAUSE_NS * 1e-9)
@@ -151,7 +161,7 @@ class Worker(threading.Thread):
     ) -> None:
         """Feed the sink that `open_sink` opens; without `pictures` it is given the frames' names and stamps alone.
 
-        A `patient` one, a viewer, leaves the processor to the others.
+        A `patient` one, for people or for later, begins with a frame when the vehicle has been told.
         """
         super().__init__(name=name, daemon=True)
         self._open, self._queue, self._stale_s = open_sink, deque[Done](maxlen=queue), stale_s
@@ -176,8 +186,6 @@ class Worker(threading.Thread):
 
     def run(self) -> None:
         """Open, feed and close the sink, again and again if need be."""
-        if self._patient:
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         while not self._over():
             try:
                 sink = self._open()
@@ -214,6 +222,8 @@ class Worker(threading.Thread):
                     return
             tick()
             if done is not None:
+                if self._patient:  # not a lower priority: who then holds the interpreter keeps everybody waiting
+                    time.sleep(_AFTER_YOU_S)
                 self._send(sink, done)
 
     def _send(self, sink: Sink, done: Done) -> None:

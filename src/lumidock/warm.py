@@ -34,7 +34,7 @@ def warm_up(process: Callable[[Frame], Fix], station: Station, camera: Camera) -
 
 
 def _picture(water: Array, station: Station, camera: Camera, k: int) -> Array:
-    """Levels (H, W), white 255, of the station's lights as spots in `water`, seen head-on and a step nearer every frame."""
+    """Levels (H, W), white 255, of the station's lights as spots in `water`, head-on and a step nearer each frame."""
     if k == _BLANK:
         return water
     image = water.copy()

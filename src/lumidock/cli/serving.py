@@ -213,7 +213,7 @@ def _file_sinks(scene: Scene, station_file: Path, out: Path | None, record: list
             raise InputError(f"--record {path}: not one of {', '.join(FILE_KINDS)}")
         if path.exists() and not force:
             raise InputError(f"{path}: exists; give --force to replace it")
-        workers.append(Worker(path.name, Numbered(path, scene).open, queue=_LONG))
+        workers.append(Worker(path.name, Numbered(path, scene).open, queue=_LONG, patient=True))
     return workers
 
 
