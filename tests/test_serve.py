@@ -166,6 +166,18 @@ def test_a_newer_frame_replaces_the_one_that_waits():
     assert (newest.dropped, newest.get(0.0)) == (2, None)
 
 
+def test_a_recording_waits_until_the_last_picture_has_been_looked_at():
+    newest = Newest()
+    newest.put(Frame("a", 0, IMAGE))
+    for looked_at in (False, True):
+        if looked_at:
+            newest.get(0.0)
+            newest.get(0.0)  # asked for the next one
+        start = time.monotonic()
+        newest.wait_until_idle(0.2)
+        assert (time.monotonic() - start < 0.1) == looked_at
+
+
 class Recorder:
     """A sink that notes what it gets; `act` may raise or wait."""
 
@@ -227,6 +239,22 @@ def test_what_is_stale_is_not_sent():
     worker.offer(made())
     worker.finish()
     assert (len(sink.got), worker.stale) == (1, 1)
+
+
+def test_a_viewer_begins_when_the_vehicle_has_been_told(monkeypatch):
+    monkeypatch.setattr("lumidock.serve._AFTER_YOU_S", 0.2)
+    began = {}
+    workers = [
+        Worker(name, lambda name=name: Recorder(lambda _: began.setdefault(name, time.monotonic())), queue=5, **options)
+        for name, options in (("viewer", {"patient": True}), ("vehicle", {}))
+    ]
+    start = time.monotonic()
+    for worker in workers:
+        worker.start()
+        worker.offer(made())
+    for worker in workers:
+        worker.finish()
+    assert began["vehicle"] - start < 0.2 <= began["viewer"] - start
 
 
 def test_a_sink_that_hangs_is_left_behind(monkeypatch):
