@@ -427,9 +427,13 @@ def test_sigterm_ends_it_in_good_order(sequence, tmp_path):
     assert (tmp_path / "live.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
 
 
+def records(folder):
+    return [word for kind in ("mcap", "mp4") for word in ("--record", folder / f"live.{kind}")]
+
+
 def killed(sequence, folder, seconds):
     """Kill a server after some seconds; returns what was in its files, and what its health had told before."""
-    served = start(sequence, "--loop", "--out", folder / "live", "--record", folder / "live.mcap")
+    served = start(sequence, "--loop", "--out", folder / "live", *records(folder))
     time.sleep(seconds)
     health = json.loads(urllib.request.urlopen(served.url + "health.json").read())
     served.kill()
@@ -448,8 +452,9 @@ def check_killed(sequence, folder, seconds):
     assert len(table) >= frames - 4  # at four frames a second
     assert all(row["status"] and None not in row for row in table)
     if frames > 4:
-        found = [item for item in open_source(folder / "live.mcap").items() if isinstance(item, Frame)]
-        assert len(found) >= frames - 4
+        for kind in ("mcap", "mp4"):
+            found = [item for item in open_source(folder / f"live.{kind}").items() if isinstance(item, Frame)]
+            assert len(found) >= frames - 4, kind
 
 
 @pytest.mark.slow

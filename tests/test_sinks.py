@@ -1,4 +1,5 @@
 import csv
+import shutil
 import sys
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ from lumidock.export import export
 from lumidock.geometry import se3_inverse
 from lumidock.sinks import Scene, open_file_sink
 from lumidock.station import load_station
+from lumidock.streams.mp4 import Mp4
 from lumidock.streams.replay import read_fixes
 from lumidock.streams.runfolder import RunFolder
 from lumidock.streams.sources import open_source
@@ -155,6 +157,19 @@ def test_a_video_shows_each_frame_at_its_time(run, sequence, tmp_path):
         shown = [(round(float(frame.time), 3), frame.width, frame.height) for frame in container.decode(video=0)]
     wanted = [(round(item.t_ns * 1e-9, 3), 320, 256) for item in open_source(sequence).items()]
     assert shown == wanted
+
+
+@pytest.mark.parametrize("step_ns", [66_000_000, 1_000_000_000])
+def test_a_video_that_nobody_closed_lacks_half_a_second_at_most(tmp_path, rng, step_ns):
+    video, path = Mp4(tmp_path / "killed.mp4"), tmp_path / "killed.mp4"
+    for number in range(12):
+        video.add(rng.integers(0, 256, (64, 96, 3), np.uint8), number * step_ns)
+        if number > 0:
+            shutil.copyfile(path, tmp_path / "now.mp4")
+            lost = number + 1 - len(list(open_source(tmp_path / "now.mp4").items()))
+            assert lost <= max(1, 500_000_000 // step_ns + 1)
+    video.close()
+    assert len(list(open_source(path).items())) == 12
 
 
 def test_parquet_is_the_table_with_types(run, tmp_path):

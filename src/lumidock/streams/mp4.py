@@ -11,7 +11,11 @@ import numpy as np
 from lumidock.datatypes import Image
 
 _CLOCK = 90_000  # ticks a second
-_FRAGMENTS = {"movflags": "frag_keyframe+empty_moov+default_base_moof", "frag_duration": "500000"}  # us
+_FRAGMENTS = {
+    "movflags": "frag_keyframe+empty_moov+default_base_moof",
+    "frag_duration": "500000",
+    "flush_packets": "1",
+}  # us
 _CODEC = {"preset": "veryfast", "tune": "zerolatency", "crf": "23"}
 
 
