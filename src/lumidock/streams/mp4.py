@@ -13,9 +13,9 @@ from lumidock.datatypes import Image
 _CLOCK = 90_000  # ticks a second
 _FRAGMENTS = {
     "movflags": "frag_keyframe+empty_moov+default_base_moof",
-    "frag_duration": "500000",
+    "frag_duration": "500000",  # us
     "flush_packets": "1",
-}  # us
+}
 _CODEC = {"preset": "veryfast", "tune": "zerolatency", "crf": "23"}
 
 
