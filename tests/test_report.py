@@ -275,6 +275,8 @@ addEventListener('load', () => {
     if (i.getBoundingClientRect().width < 250) bad.push('picture small');
   for (const e of document.querySelectorAll('h1, h2, h3, p, figcaption, .tile, li'))
     if (e.scrollWidth > e.clientWidth + 1 && e.clientWidth) bad.push('cut off: ' + e.textContent.slice(0, 40));
+  for (const e of document.querySelectorAll('caption span'))
+    if (e.getBoundingClientRect().right > width) bad.push('cut off: ' + e.textContent.slice(0, 40));
   document.title = 'PROBED ' + getComputedStyle(document.body).backgroundColor + ' ' + bad.slice(0, 8).join('; ');
 });
 </script>

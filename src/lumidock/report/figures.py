@@ -377,7 +377,7 @@ def _draw_latency(figure: Figure, views: Sequence[RunView]) -> None:
     axes.xaxis.set_major_formatter(lambda value, _at: f"{value:g}")
     axes.xaxis.set_minor_formatter(lambda _value, _at: "")
     if len(views) > 1:
-        axes.legend()
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)  # above: bars may be high anywhere
 
 
 # Several runs
