@@ -327,10 +327,10 @@ def test_a_recording_is_shown_at_its_own_pace_and_again(monkeypatch):
     seen = Recorder()
     frames = [Frame(str(i), i * 50_000_000, IMAGE) for i in range(4)]
     served = server(lambda: iter(frames), [Worker("w", lambda: seen, queue=9)], loop=True)
-    threading.Timer(0.55, served.stop.set).start()
+    threading.Timer(1.0, served.stop.set).start()  # of which the first garbage collection may take a part
     start = time.monotonic()
     served.serve()
-    assert 0.4 < time.monotonic() - start < 2.0
+    assert 0.4 < time.monotonic() - start < 3.0
     t_ns = [fix.t_ns for _, fix, _ in seen.got]
     assert (
         t_ns[:8]
