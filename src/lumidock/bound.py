@@ -37,7 +37,7 @@ class Bound:
     def forget(self) -> None:
         """Start anew, as before the first frame."""
         self._P: Array | None = None
-        self._t_ns = self._lights_ns = 0
+        self._t_ns = self._lights_ns = self._agreed_ns = 0
         self._joint = False
         self._known = np.zeros(self._plan.n_layers, bool)
 
@@ -57,8 +57,11 @@ class Bound:
         if len(lights):
             self._update(R, t, T_dock_cam, lights)
             self._lights_ns = t_ns
+            self._agreed_ns = t_ns if len(lights) >= _MIN_START else self._agreed_ns
         elif t_ns - self._lights_ns > self.config.integrity.max_age_s * 1e9:
             return None
+        if t_ns - self._agreed_ns > self.config.track.max_gap_s * 1e9:
+            return None  # three lights fit many poses
         nothing = np.zeros((len(self.station), 18))
         return np.array(
             kernel.levels(

@@ -250,6 +250,8 @@ class Localizer:
         """The fix of the likeliest belief, as far as it can be trusted."""
         first, config = self.beliefs[0], self.config.integrity
         bound = integrity.bounds(self.beliefs, config)
+        if first.proof == 0:  # what one frame once decided no longer stands for the names
+            self.margin = min(self.margin, config.evidence)
         proven = verify.is_proven(first, self.margin, config)
         valid = proven and integrity.pose_holds(bound)
         self._stage = integrity.stage(first, self._plan) or self._stage
@@ -275,6 +277,7 @@ class Localizer:
         self.beliefs = [replace(b, name=nothing, proof=0 if reason == "residual" else b.proof) for b in self.beliefs]
         age_s = (detections.t_ns - self.beliefs[0].lights_ns) * 1e-9
         if self.beliefs[0].proof == 0:  # nothing has agreed since a test failed
+            self.margin = min(self.margin, self.config.integrity.evidence)
             return self._no_fix(detections, "coasting", "residual")
         if age_s > self.config.integrity.max_age_s:
             return self._no_fix(detections, "coasting", "stale")

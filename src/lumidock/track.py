@@ -33,8 +33,9 @@ class Track:
 
     `R`, `t` of T_cam_dock; `x` (n,) twist and slow states, `P` (n, n) their covariance with the pose's (order in
     `_kernels.track`). `joint`: slow states are being estimated. `log_weight`: log evidence since the track began.
-    `proof`: frames since the last failed test in which four lights agreed. `lights_ns`, `layer_ns` (L,): when any
-    light and when each layer was seen last. Of the last frame: `name` (M,) the detection of each light, `apart` (M, 18)
+    `proof`: frames since the last failed test in which four lights agreed; it is lost when none do for too long, since
+    three fit many poses. `lights_ns`, `agreed_ns`, `layer_ns` (L,): when any light, when four and when each layer was
+    seen last. Of the last frame: `name` (M,) the detection of each light, `apart` (M, 18)
     what leaving one out would do, `plane` (6,) the one that all lie on (NaN: none), `nis` the normalised innovation
     squared, `surprise` the same as a normal deviate, and `strain` the running mean of that over frames.
     """
@@ -49,6 +50,7 @@ class Track:
     log_weight: float
     proof: int
     lights_ns: int
+    agreed_ns: int
     layer_ns: Indices
     name: Indices
     apart: Array
@@ -113,6 +115,7 @@ def start(
         0.0,
         0,
         t_ns,
+        _NEVER,
         never,
         name,
         np.zeros((len(name), 18)),
@@ -279,7 +282,9 @@ def update(
     # a pose of which nothing was known takes up six of the pixels' degrees of freedom
     dof = 2 * int(count.sum()) - (0 if at is None else 6)
     surprise = _deviate(nis, dof) if dof > 0 else 0.0
-    proof = track.proof + int(count.sum() >= _PROOF_LIGHTS)
+    agreed_ns = track.t_ns if count.sum() >= _PROOF_LIGHTS else track.agreed_ns
+    lately = track.t_ns - track.agreed_ns <= config.max_gap_s * 1e9
+    proof = (track.proof if lately else 0) + int(agreed_ns == track.t_ns)
     return Track(
         track.t_ns,
         track.began_ns,
@@ -291,6 +296,7 @@ def update(
         track.log_weight,
         proof,
         track.t_ns,
+        agreed_ns,
         layer_ns,
         name,
         apart,
