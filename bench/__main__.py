@@ -11,7 +11,19 @@ import sys
 import time
 from pathlib import Path
 
-from bench import contact_sheet, detection, doors, images, rendering, reproduced, speed, table1, visibility, waters
+from bench import (
+    contact_sheet,
+    detection,
+    detector_errors,
+    doors,
+    images,
+    rendering,
+    reproduced,
+    speed,
+    table1,
+    visibility,
+    waters,
+)
 
 BENCHES = {
     "doors": doors,
@@ -19,6 +31,7 @@ BENCHES = {
     "images": images,
     "speed": speed,
     "detection": detection,
+    "detector-errors": detector_errors,
     "waters": waters,
     "visibility": visibility,
     "rendering": rendering,

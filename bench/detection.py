@@ -13,7 +13,7 @@ import numpy as np
 
 from lumidock import detect, layers
 from lumidock.config import Config
-from lumidock.datatypes import Detections, Frame
+from lumidock.datatypes import Array, Detections, Frame
 from lumidock.sim.scenario import shipped_scenarios
 from lumidock.streams.sources import open_source
 
@@ -33,14 +33,13 @@ def by_frame(path: Path) -> Rows:
     return rows
 
 
-def matches(found: Detections, lamps: list[dict[str, str]]) -> np.ndarray:
-    """Index (N,) of the lamp that made each detection, -1 for none: the nearest, each once."""
+def matches(found: Detections, uv: Array, near_px: float = _NEAR_PX) -> np.ndarray:
+    """Index (N,) of the lamp, of those at pixels `uv` (M, 2), that made each detection; -1: none. Nearest first."""
     owner = np.full(len(found), -1)
-    if not lamps or not len(found):
+    if not len(uv) or not len(found):
         return owner
-    uv = np.array([[float(row["u_px"]), float(row["v_px"])] for row in lamps])
     distance = np.linalg.norm(found.uv[:, None] - uv[None], axis=2)
-    reach = np.maximum(_NEAR_PX, 0.5 * found.radius_px)[:, None]
+    reach = np.maximum(near_px, 0.5 * found.radius_px)[:, None]
     distance[distance > reach] = np.inf
     while np.isfinite(distance).any():
         i, k = np.unravel_index(distance.argmin(), distance.shape)
@@ -65,7 +64,8 @@ def measure(folder: Path) -> dict[str, float]:
         scan = scan or detect.Scan(frame, config.detect)
         found = layers.label(frame, detect.lights(frame, config.detect, scan), config.label)
         lit = [row for row in truth[frame.name] if float(row["snr"] or 0) > 4.0]
-        owner = matches(found, lit)
+        lit_uv = np.array([[float(row["u_px"]), float(row["v_px"])] for row in lit]).reshape(-1, 2)
+        owner = matches(found, lit_uv)
         frames, spots = frames + 1, spots + len(found)
         snr = np.array([float(row["snr"]) for row in lit])
         for least in _SNRS:

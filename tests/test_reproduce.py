@@ -1,5 +1,7 @@
 """Reproduction: the same numbers for the same seeds, nothing done twice, and a page that is whole."""
 
+import csv
+import filecmp
 import json
 from dataclasses import replace
 
@@ -8,13 +10,22 @@ import pytest
 from bench.shipped import CAMERA_FILE, STATION_FILE, shipped_camera, shipped_station
 from test_report import CHROMIUM, Reader, probe
 
+from lumidock.camera import load_camera
+from lumidock.config import Config
 from lumidock.datatypes import Detections, Fix, Match
 from lumidock.errors import InputError
+from lumidock.localizer import Localizer
 from lumidock.reproduce import FULL, QUICK, reproduce, work
 from lumidock.reproduce.jobs import Job, run_jobs
 from lumidock.reproduce.plan import jobs_of
 from lumidock.reproduce.trials import Counts, trial, verdict
+from lumidock.run import Setup, run
+from lumidock.sim.measured import measured_like
+from lumidock.sim.scenario import load_scenario, shipped_scenarios
+from lumidock.sim.sequence import write_rendered
 from lumidock.sim.spots import SpotFrame
+from lumidock.streams.runfolder import RunFolder
+from lumidock.streams.sources import open_source
 
 DOCK = (str(STATION_FILE), str(CAMERA_FILE))
 TINY = replace(
@@ -85,6 +96,49 @@ def test_what_is_done_is_not_done_again_and_what_changed_is(tmp_path):
     assert run_jobs([job], tmp_path, "dock", workers=0) == first
     other = replace(job, arguments=(DOCK, "missing-1", settings, 4))
     assert json.loads(file.read_text())["key"] != other.key("dock")
+
+
+def fixes_of(folder):
+    """Rows of a run without their times."""
+    with (folder / "fixes.csv").open(newline="") as file:
+        return [{k: v for k, v in row.items() if k != "latency_us"} for row in csv.DictReader(file)]
+
+
+def test_frames_in_memory_give_the_fixes_of_frames_on_disk(tmp_path):
+    settings = ["path.frame_interval_s=2.5", "stream.half_written=0.2", "stream.duplicated=0.3"]
+    kept = work.docking(DOCK, "stream-faults", settings, 5, str(tmp_path / "kept"), True)
+    work.docking(DOCK, "stream-faults", settings, 5, str(tmp_path / "memory"), False)
+    disk, sequence = tmp_path / "disk", tmp_path / "memory" / "sequence"
+    station, camera = shipped_station(), shipped_camera()
+    write_rendered(load_scenario("stream-faults", tuple(settings)), station, camera, 5, disk, workers=1)
+    pictures = sorted(file.name for file in (disk / "frames").iterdir())
+    assert filecmp.cmpfiles(disk / "frames", tmp_path / "kept" / "sequence" / "frames", pictures, False)[0] == pictures
+    assert not (sequence / "frames").exists()
+    truth = sorted(file.name for file in disk.iterdir() if file.is_file())
+    assert "stream_truth.csv" in truth
+    assert filecmp.cmpfiles(disk, sequence, truth, False)[0] == truth
+    with RunFolder(tmp_path / "run", station.ids) as folder:
+        localizer = Localizer(station, load_camera(disk / "camera.yaml"))
+        run(
+            open_source(disk), localizer, folder, Setup("lumidock", False, Config(), STATION_FILE, disk / "camera.yaml")
+        )
+    rows = fixes_of(tmp_path / "run")
+    assert rows == fixes_of(tmp_path / "memory" / "lumidock") == fixes_of(tmp_path / "kept" / "lumidock")
+    assert {"bad_frame", "bad_stamp"} <= {row["reason"] for row in rows}
+    assert sum(row["valid"] == "1" for row in rows) == kept["lumidock"]["valid"] > 0
+
+
+def test_every_shipped_docking_is_run_at_point_level_with_the_detectors_errors(tmp_path):
+    jobs = {job.name: job for job in jobs_of(FULL, DOCK, tmp_path) if job.name.startswith("point-")}
+    paths = [name for name in shipped_scenarios() if load_scenario(name).path.kind != "draws"]
+    for name in paths:
+        for seed in range(20):
+            _, scenario, (setting,), first, stop = jobs[f"point-{name}-{FULL.first_seed + seed}"].arguments
+            assert (scenario, first, stop) == (name, FULL.first_seed + seed, FULL.first_seed + seed + 1)
+            assert setting == f"spots.detector={measured_like(load_scenario(name))}"
+    assert len(jobs) == 20 * len(paths)
+    counts = jobs[f"point-rectangle-{FULL.first_seed}"].call(*jobs[f"point-rectangle-{FULL.first_seed}"].arguments)
+    assert counts["counts"]["frames"] == 127
 
 
 @pytest.mark.parametrize("grid", [TINY, QUICK, FULL])

@@ -178,10 +178,10 @@ def _digest(content: bytes) -> str:
 
 @cache
 def source_digest() -> str:
-    """Of all source of the package: counts are not mixed between versions of it."""
+    """Of all source of the package and its measured tables: counts are not mixed between versions of it."""
     digest = hashlib.sha256()
     package = Path(__file__).parent
-    for path in sorted(package.rglob("*.py")):
+    for path in sorted((*package.rglob("*.py"), *package.rglob("*.json"))):
         digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 

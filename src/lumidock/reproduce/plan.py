@@ -8,6 +8,7 @@ from lumidock.reproduce import work
 from lumidock.reproduce.grid import Grid
 from lumidock.reproduce.jobs import Job
 from lumidock.reproduce.paper import DISTANCES_M, TABLE_1
+from lumidock.sim.measured import measured_like
 from lumidock.sim.scenario import load_scenario, shipped_scenarios
 
 ROWS = (*((*faults, False) for faults in TABLE_1), (1, 1, False), (1, 1, True), (3, 2, True))
@@ -130,14 +131,15 @@ def _envelope(grid: Grid, dock: work.Dock) -> list[Job]:
 
 
 def _point_level(grid: Grid, dock: work.Dock) -> list[Job]:
-    """Every shipped scenario that goes along a path, as bare detections; those that differ in pictures only, once."""
-    names: dict[str, str] = {}
-    for name in ("approach", *shipped_scenarios()):
+    """Every shipped scenario with a path, as bare detections by a detector that errs as it does on its pictures."""
+    jobs = []
+    for name in shipped_scenarios():
         scenario = load_scenario(name)
-        if scenario.path.kind != "draws":
-            names.setdefault(scenario.model_dump_json(include={"path", "faults", "spots", "config"}), name)
-    return [
-        Job(f"point-{name}-{seed}", 6, work.campaign, (dock, name, seed, seed + 1))
-        for name in names.values()
-        for seed in range(grid.first_seed, grid.first_seed + grid.point_seeds)
-    ]
+        if scenario.path.kind == "draws":
+            continue
+        settings = [f"spots.detector={measured_like(scenario)}"]
+        jobs += [
+            Job(f"point-{name}-{seed}", 2, work.campaign, (dock, name, settings, seed, seed + 1))
+            for seed in range(grid.first_seed, grid.first_seed + grid.point_seeds)
+        ]
+    return jobs

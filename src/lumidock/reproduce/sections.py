@@ -11,6 +11,7 @@ from lumidock.report import figures
 from lumidock.report.moments import pictures
 from lumidock.report.view import load_run
 from lumidock.reproduce import plots
+from lumidock.reproduce.detector import detector_table
 from lumidock.reproduce.grid import Grid
 from lumidock.reproduce.paper import (
     AXIS_M,
@@ -80,9 +81,10 @@ _ENVELOPE_TEXT = (
     "by bearing and range (guide) and by full pose (valid); the paper's by its pose, which it does not vouch for."
 )
 _HAZARD_TEXT = (
-    "Every shipped docking: frames that claim to be usable while their error is over the alert limit. Point "
-    "level: bare "
-    "detections with the errors that the scenario states."
+    "Every shipped docking: frames that claim to be usable while their error is over the alert limit. Point level: "
+    "bare detections that are missed, err and are false as measured on rendered frames of the scenario's water and "
+    "lights, drawn anew in each frame and false ones anywhere in the picture: of mirror images and glints that stand "
+    "where a light might, and of errors that last, the rendered rows tell."
 )
 
 
@@ -382,7 +384,8 @@ def _hazards(results: Results) -> list[Any]:
             "Frames of our method, and those hazardously misleading.",
             head,
             [[n, *map(str, v)] for n, v in rows.items()],
-        )
+        ),
+        detector_table(),
     ]
 
 

@@ -15,7 +15,7 @@ from lumidock.camera import Camera, load_camera
 from lumidock.campaign import plan, run_shard
 from lumidock.campaign_table import row_of
 from lumidock.config import Config, PaperConfig
-from lumidock.datatypes import Array, Fix, Frame
+from lumidock.datatypes import Array, Fix, Frame, Unusable
 from lumidock.errors import FrameError
 from lumidock.localizer import Localizer
 from lumidock.metrics import evaluate, true_poses
@@ -25,18 +25,20 @@ from lumidock.pose import project_lights
 from lumidock.reproduce.trials import Counts, trial, trials_scenario, verdict
 from lumidock.run import Setup, TwoDoors, run
 from lumidock.sim.scenario import Scenario, load_scenario, spurious_paths, trajectory
-from lumidock.sim.sequence import render_frame, write_rendered
+from lumidock.sim.sequence import file_of, render_frame, rendered
 from lumidock.sim.spots import SpotFrame, spot_frames
+from lumidock.sim.stream import Row
 from lumidock.station import Station, load_station
-from lumidock.streams.images import read_image
+from lumidock.streams.images import decode_image
 from lumidock.streams.replay import read_fixes
 from lumidock.streams.runfolder import RunFolder
-from lumidock.streams.sources import open_source
+from lumidock.streams.sources import Source
 from lumidock.tally import Tally
 
 METHODS = ("lumidock", "paper")
 _FOUR = 4  # named lights of a layer that give a pose by it alone
 Dock = tuple[str, str]  # station and camera file
+Pictures = list[tuple[Row, bytes]]  # a sequence in memory, as `rendered` gives it
 
 
 def _load(dock: Dock) -> tuple[Station, Camera]:
@@ -75,9 +77,9 @@ def cold_start(dock: Dock, scenario: str, settings: list[str], seed: int) -> dic
     return result
 
 
-def campaign(dock: Dock, scenario: str, first: int, stop: int) -> dict[str, Any]:
+def campaign(dock: Dock, scenario: str, settings: list[str], first: int, stop: int) -> dict[str, Any]:
     """Seeds of a shipped scenario at point level by our method: a row of a campaign's table."""
-    loaded, tally = load_scenario(scenario), Tally()
+    loaded, tally = load_scenario(scenario, tuple(settings)), Tally()
     for shard in plan([loaded], ["lumidock"], (first, stop), Path(dock[0]), Path(dock[1])).shards:
         tally.merge(Tally.from_dict(run_shard(shard)["tally"]))
     return row_of(tally)
@@ -87,25 +89,27 @@ def campaign(dock: Dock, scenario: str, first: int, stop: int) -> dict[str, Any]
 
 
 def docking(dock: Dock, scenario: str, settings: list[str], seed: int, folder: str, keep: bool) -> dict[str, Any]:
-    """Render a scenario into `folder` and run both methods on it; its pictures stay when they are to be shown."""
+    """Render a scenario in memory and run both methods on it, into `folder`; pictures only to `keep` land there."""
     station, camera = _load(dock)
     loaded, place = load_scenario(scenario, tuple(settings)), Path(folder)
     shutil.rmtree(place, ignore_errors=True)
     sequence = place / "sequence"
     sequence.mkdir(parents=True)
     shutil.copyfile(dock[0], sequence / "station.yaml")
-    write_rendered(loaded, station, camera, seed, sequence, workers=1)
-    result = {method: _run_method(dock, method, sequence, place / method) for method in METHODS}
-    if not keep:
-        shutil.rmtree(sequence / "frames")
-    return result
+    pictures = rendered(loaded, station, camera, seed, sequence)
+    if keep:
+        (sequence / "frames").mkdir()
+        for row, content in pictures:
+            (sequence / "frames" / file_of(row, loaded)).write_bytes(content)
+    return {method: _run_method(dock, method, sequence, pictures, place / method) for method in METHODS}
 
 
-def _run_method(dock: Dock, method: str, sequence: Path, out: Path) -> dict[str, Any]:
+def _run_method(dock: Dock, method: str, sequence: Path, pictures: Pictures, out: Path) -> dict[str, Any]:
     station, camera = _load(dock)
     files = Path(dock[0]), sequence / "camera.yaml"
-    setup, source = Setup(method, False, Config(), *files), open_source(sequence)
-    _warm(method, station, camera, sequence)
+    setup, inputs = Setup(method, False, Config(), *files), (sequence / "timestamps.csv",)
+    source = Source(sequence, "sequence", lambda: _items(pictures), len(pictures), inputs=inputs)
+    _warm(_localizer(method, station, camera), pictures)
     with RunFolder(out, station.ids) as run_folder:
         for file, name in zip(files, ("station.yaml", "camera.yaml"), strict=True):
             shutil.copyfile(file, out / name)
@@ -113,13 +117,21 @@ def _run_method(dock: Dock, method: str, sequence: Path, out: Path) -> dict[str,
     return evaluate(out, sequence) | reach(out, sequence)
 
 
-def _warm(method: str, station: Station, camera: Camera, sequence: Path) -> None:
+def _items(pictures: Pictures) -> Iterator[Frame | Unusable]:
+    """Frames, or what is wrong with their pictures."""
+    for row, content in pictures:
+        try:
+            yield Frame(row.name, row.t_ns, decode_image(content, row.name))
+        except FrameError as error:
+            yield Unusable(row.name, row.t_ns, error.reason, str(error))
+
+
+def _warm(localizer: TwoDoors, pictures: Pictures) -> None:
     """Compile before times are taken: the first frames of a machine take seconds more."""
-    localizer = _localizer(method, station, camera)
-    pictures = sorted((sequence / "frames").iterdir())
-    for number, picture in enumerate(pictures[:: max(1, len(pictures) // 6)]):
-        with suppress(FrameError):  # some scenarios have damaged ones
-            localizer.process(Frame(picture.stem, number, read_image(picture)))
+    for item in _items(pictures[:: max(1, len(pictures) // 6)]):
+        with suppress(FrameError):
+            if isinstance(item, Frame):
+                localizer.process(item)
 
 
 def reach(run_folder: Path, truth: Path) -> dict[str, Any]:

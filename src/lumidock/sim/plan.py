@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -129,6 +129,14 @@ def plan_of(scenario: Scenario, station: Station, camera: Camera, seed: int) -> 
         wander = spurious_paths(scenario, course.t_ns, size, np.random.default_rng([seed, 2]))
     exposure_s = np.full(len(course.t_ns), scenario.sensor.exposure_ms * 1e-3)
     return Plan(scenario, station, camera, seed, course, world, wander, exposure_s)
+
+
+def exposed(plan: Plan) -> Plan:
+    """The same with the exposures of its control loop, if the scenario has one."""
+    control = plan.scenario.sensor.auto_exposure
+    if control is None:
+        return plan
+    return replace(plan, exposure_s=controlled(plan, control, [metered(plan, k) for k in range(len(plan))]))
 
 
 def metered(plan: Plan, number: int) -> Indices:

@@ -118,6 +118,9 @@ class BlackOuts(Section):
 class Spots(Section):
     """Bare detections, made without rendering. What is drawn for a run is drawn for each draw of a path of draws."""
 
+    # a shipped scenario, on whose frames it was measured how the detector finds lights, errs in their centres and
+    # layers, and sees false ones; in place of noise_px, the ranges, wrong_layer and color, as in a rendering
+    detector: str = ""
     noise_px: NonNegativeFloat = 0.5
     front_range_m: Lengths = (40.0, 40.0)  # from a light; beyond it the light is not seen; drawn for a run
     rear_range_m: Lengths = (20.0, 20.0)

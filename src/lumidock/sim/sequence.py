@@ -22,12 +22,13 @@ from lumidock.datatypes import Array, Indices
 from lumidock.errors import InputError, LumidockError
 from lumidock.geometry import quat_xyzw_from_rotation
 from lumidock.sim.frames import Moment, Shot, Studio
+from lumidock.sim.knobs import Output
 from lumidock.sim.lens import Lens, calibrated_in_water
 from lumidock.sim.optics import Emitters
-from lumidock.sim.plan import Plan, controlled, metered, plan_of
+from lumidock.sim.plan import Plan, controlled, exposed, metered, plan_of
 from lumidock.sim.scenario import Scenario
 from lumidock.sim.spots import SpotFrame, spot_frames
-from lumidock.sim.stream import OVER_EXPOSED, Row, cut, rows_of
+from lumidock.sim.stream import OVER_EXPOSED, Row, rows_of
 from lumidock.sim.water import green_index
 from lumidock.station import Station
 
@@ -92,15 +93,12 @@ def write_rendered(
 
     With `video` the pictures go into video.mp4 instead of frames/.
     """
-    plan = plan_of(scenario, station, camera, seed)
-    rows = rows_of(scenario.stream, plan.course.t_ns, np.random.default_rng([seed, 6]))
-    if not rows:
-        raise InputError(f"{scenario.name}: every frame is dropped")
+    plan, rows = _planned(scenario, station, camera, seed)
     if video and scenario.output.pixels not in ("bgr8", "mono8"):
         raise InputError(f"output.pixels: a video holds bgr8 or mono8, not {scenario.output.pixels}")
     (out / "frames").mkdir(parents=True, exist_ok=True)
     control = scenario.sensor.auto_exposure
-    once = list({row.number: row for row in reversed(rows)}.values())[::-1]  # a doubled row has one file
+    once = _once(rows)
     total = len(once) + (len(plan) if control else 0)
     with _mapping(workers or os.cpu_count() or 1) as mapping:
         if control:
@@ -112,6 +110,33 @@ def write_rendered(
     if video:
         _into_video(rows, out, scenario)
     return len(rows)
+
+
+def rendered(scenario: Scenario, station: Station, camera: Camera, seed: int, out: Path) -> list[tuple[Row, bytes]]:
+    """Render in this process and in memory: every row of timestamps.csv, and the content of its picture's file.
+
+    What `write_rendered` writes beside the pictures is written into the folder `out`.
+    """
+    plan, rows = _planned(scenario, station, camera, seed)
+    plan, once = exposed(plan), _once(rows)
+    pictures, truths = zip(*(_taken(plan, row) for row in once), strict=True)
+    _write_truth(plan, rows, dict(zip(once, truths, strict=True)), out)
+    picture = {row.number: content for row, content in zip(once, pictures, strict=True)}
+    return [(row, picture[row.number]) for row in rows]
+
+
+def _once(rows: list[Row]) -> list[Row]:
+    """The rows with a picture of their own: a doubled row has one file."""
+    return list({row.number: row for row in reversed(rows)}.values())[::-1]
+
+
+def _planned(scenario: Scenario, station: Station, camera: Camera, seed: int) -> tuple[Plan, list[Row]]:
+    """What is rendered, and the rows of timestamps.csv. Raises: InputError when there would be none."""
+    plan = plan_of(scenario, station, camera, seed)
+    rows = rows_of(scenario.stream, plan.course.t_ns, np.random.default_rng([seed, 6]))
+    if not rows:
+        raise InputError(f"{scenario.name}: every frame is dropped")
+    return plan, rows
 
 
 def _counted(results: Iterable[Any], progress: Progress, done: int, total: int) -> list[Any]:
@@ -136,7 +161,13 @@ def _mapping(workers: int) -> Iterator[Callable[..., Iterable[Any]]]:
 
 def _write_frame(plan: Plan, out: Path, row: Row) -> _Written:
     """Render the picture of one row to its file, and say what is in it."""
-    scenario = plan.scenario
+    picture, truth = _taken(plan, row)
+    (out / "frames" / file_of(row, plan.scenario)).write_bytes(picture)
+    return truth
+
+
+def _taken(plan: Plan, row: Row) -> tuple[bytes, _Written]:
+    """The file with the picture of one row, and what is in it."""
     studio, moment = plan.studio(row.shows), plan.moment(row.shows)
     if row.fault == "over_exposed":
         moment = replace(moment, exposure_s=moment.exposure_s * OVER_EXPOSED)
@@ -144,17 +175,24 @@ def _write_frame(plan: Plan, out: Path, row: Row) -> _Written:
     image = studio.develop(shot, np.random.Generator(np.random.SFC64([plan.seed, 9, row.shows])))
     if row.fault in ("black", "white"):
         image[...] = 0 if row.fault == "black" else np.iinfo(image.dtype).max
-    path = out / "frames" / _file_of(row, scenario)
-    options = [cv2.IMWRITE_JPEG_QUALITY, scenario.output.quality] if scenario.output.file == "jpg" else _PNG_OPTIONS
-    if not cv2.imwrite(str(path), image, options):
-        raise LumidockError(f"{path}: cannot be written")
+    content = encoded(image, plan.scenario.output)
     if row.fault == "half_written":
-        cut(path)
+        content = content[: len(content) // 2]
     lost = row.fault in ("black", "white", "half_written")
-    return _truth_of(studio, shot, lost)
+    return content, _truth_of(studio, shot, lost)
 
 
-def _file_of(row: Row, scenario: Scenario) -> str:
+def encoded(image: np.ndarray, output: Output) -> bytes:
+    """The content of a picture's file."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, output.quality] if output.file == "jpg" else _PNG_OPTIONS
+    done, content = cv2.imencode(f".{output.file}", image, options)
+    if not done:
+        raise LumidockError(f"a picture cannot be encoded as {output.file}")
+    return content.tobytes()
+
+
+def file_of(row: Row, scenario: Scenario) -> str:
+    """Name of the row's picture."""
     return f"{row.name}.{scenario.output.file}"
 
 
@@ -185,7 +223,7 @@ def _write_truth(plan: Plan, rows: list[Row], written: dict[Row, _Written], out:
     raw = scenario.output.pixels.startswith("bayer")
     columns = ("frame", "file", "t_ns", *(("encoding",) if raw else ()))
     encoding = [f"bayer_{scenario.output.pattern}{scenario.output.pixels.removeprefix('bayer')}"] if raw else []
-    _write_csv(out / "timestamps.csv", columns, ([r.name, _file_of(r, scenario), r.t_ns, *encoding] for r in rows))
+    _write_csv(out / "timestamps.csv", columns, ([r.name, file_of(r, scenario), r.t_ns, *encoding] for r in rows))
     names = [row.name for row in written]
     poses = plan.course.T_dock_cam[[row.number for row in written]]
     _write_poses(out, names, [row.t_ns for row in written], poses)
@@ -199,7 +237,7 @@ def _into_video(rows: list[Row], out: Path, scenario: Scenario) -> None:
     """Make a video of the pictures, which are then gone; what cannot be decoded is left out as a recorder would."""
     video, writer = out / "video.mp4", None
     for row in rows:
-        image = cv2.imread(str(out / "frames" / _file_of(row, scenario)), cv2.IMREAD_COLOR)
+        image = cv2.imread(str(out / "frames" / file_of(row, scenario)), cv2.IMREAD_COLOR)
         if image is None:
             continue
         if writer is None:
@@ -241,8 +279,8 @@ DETECTION_COLUMNS = ("frame", "u_px", "v_px", "radius_px", "flux", "p_light", "p
 def _detection_rows(frames: list[SpotFrame]) -> Iterator[list[object]]:
     for frame in frames:
         d = frame.detections
-        for (u, v), p_rear in zip(d.uv, d.p_rear, strict=True):
-            yield [d.frame, f"{u:.4f}", f"{v:.4f}", "", "", "1", f"{p_rear:.3f}"]
+        for (u, v), p_light, p_rear in zip(d.uv, d.p_light, d.p_rear, strict=True):
+            yield [d.frame, f"{u:.4f}", f"{v:.4f}", "", "", f"{p_light:.3g}", f"{p_rear:.3f}"]
 
 
 def _spot_spurious(frame: SpotFrame) -> list[Line]:

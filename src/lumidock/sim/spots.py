@@ -15,6 +15,7 @@ from lumidock.camera import Camera
 from lumidock.datatypes import Array, Attitude, Detections, Indices
 from lumidock.errors import InputError
 from lumidock.pose import project_lights
+from lumidock.sim.measured import Looks, SpotTable, as_measured, detector_errors, with_false
 from lumidock.sim.scenario import (
     R_DOCK_CAM_HEAD_ON,
     BlackOuts,
@@ -84,15 +85,6 @@ class World:
     black: np.ndarray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Spots:
-    """S spots, those of one frame in a row: the `frame` of each (S,), true pixels `uv` (S, 2) and `light` (S,)."""
-
-    frame: Indices
-    uv: Array
-    light: Indices
-
-
 def in_view(station: Station, camera: Camera, T_dock_cam: Array) -> tuple[Array, np.ndarray]:
     """Pixels (M, 2) of all lights and which of them (M,) lie in the picture and shine toward the camera."""
     uv = project_lights(camera, T_dock_cam, station.p_dock)
@@ -120,15 +112,26 @@ def spot_frames(scenario: Scenario, station: Station, camera: Camera, seed: int)
     world = world_of(scenario, station, course, np.random.default_rng([seed, 4]))
     wander = _wandering(scenario, camera, course, np.random.default_rng([seed, 2]))
     rng = np.random.default_rng([seed, 1])
-    uv, visible = _shown(scenario, station, camera, course, world)
+    uv, visible, range_m = _shown(scenario, station, camera, course, world)
     lit = visible & ~_dark(scenario, station, course, world, visible, rng)
     strays = _strays(scenario, world, wander, _box(scenario, camera, uv, visible), rng)
-    spots = _in_a_row(uv, lit, strays, scenario.shows_dock)
+    errors = detector_errors(scenario.spots.detector) if scenario.spots.detector else None
+    detector_rng = np.random.default_rng([seed, 15])
+    if errors:
+        lit &= errors.found(_is_rear(station), range_m, detector_rng)
+    spots = _in_a_row(uv, lit, strays, range_m, scenario.shows_dock)
+    if errors:
+        dock_m = np.linalg.norm(course.T_dock_cam[:, :3, 3], axis=1)
+        spots = with_false(spots, errors, np.where(world.black, np.nan, dock_m), camera, detector_rng)
     attitudes = _attitudes(scenario, course, np.random.default_rng([seed, 5]))
     if not scenario.shows_dock:
         uv, visible = _unseen(scenario, camera, course, world, uv), np.zeros_like(visible)
     noise = rng.normal(0.0, 1.0, spots.uv.shape) * scenario.spots.noise_px
-    detections = _detections(course, spots, spots.uv + noise, _p_rear(scenario, station, spots.light, rng), attitudes)
+    sure, p_rear = np.ones(len(noise)), _p_rear(scenario, station, spots.light, rng)
+    looks = Looks(noise, None, sure, p_rear)
+    if errors:
+        looks = as_measured(errors, looks, spots, _is_rear(station), scenario.spots.noise_px, detector_rng)
+    detections = _detections(course, spots, looks, attitudes)
     ends = _ends(course, spots)
     light = [spots.light[a:b] for a, b in pairwise(ends)]
     yield from map(
@@ -246,13 +249,13 @@ def world_of(scenario: Scenario, station: Station, course: Course, rng: np.rando
     g, m, spots = len(course.surface_m), len(station), scenario.spots
     off = rng.normal(size=(g, m, 3)) * station.sigma_light_m
     off += (rng.normal(size=(g, len(station.layers), 3)) * station.sigma_layer_m)[:, station.layer]
-    front = station.layer == station.layers.index(station.layers_front_to_rear()[0])
+    front = ~_is_rear(station)
     front_m, rear_m = (rng.uniform(*reach, (g, 1)) for reach in (spots.front_range_m, spots.rear_range_m))
     lens = rng.normal(size=(g, 3)) * [station.sigma_focal, station.sigma_center_px, station.sigma_center_px]
     lens *= spots.calibration
     return World(
         p_dock=station.p_dock + off * spots.survey,
-        reach_m=np.where(front, front_m, rear_m),
+        reach_m=np.where(front, front_m, rear_m) if not spots.detector else np.full((g, m), np.inf),
         dead=_some(np.ones((g, m), bool), rng.integers(*spots.dead, g, endpoint=True), rng),
         focal=lens[:, 0] + scenario.lens.focal_error,
         center_px=lens[:, 1:],
@@ -278,21 +281,22 @@ def _black(knobs: BlackOuts, t_s: Array, rng: np.random.Generator) -> np.ndarray
 
 def _shown(
     scenario: Scenario, station: Station, camera: Camera, course: Course, world: World
-) -> tuple[Array, np.ndarray]:
-    """True pixels (N, M, 2) of all lights, or of their mirror images, and which (N, M) can be seen."""
+) -> tuple[Array, np.ndarray, Array]:
+    """True pixels (N, M, 2) of all lights, or of their mirror images, which (N, M) can be seen, and ranges (N, M) m."""
     p_dock = world.p_dock[course.run]
     if scenario.spots.mirror == "only":
         p_dock = _mirrored(p_dock, course.surface_m[course.run])
     uv, p_cam = _project(camera, course.T_dock_cam, p_dock)
     uv = _through_lens(camera, course, world, uv)
-    near = np.linalg.norm(p_cam, axis=2) < world.reach_m[course.run]
+    range_m = np.linalg.norm(p_cam, axis=2)
+    seen = camera.contains(uv) & (range_m < world.reach_m[course.run]) & shown_layers(scenario, station)
     shining = _shining(station.axis, scenario, course.T_dock_cam, p_dock)
-    return uv, camera.contains(uv) & shining & near & shown_layers(scenario, station) & scenario.spots.dock
+    return uv, seen & shining & scenario.spots.dock, range_m
 
 
 def shown_layers(scenario: Scenario, station: Station) -> np.ndarray:
     """Which lights (M,) belong to a layer that shines."""
-    front = station.layer == station.layers.index(station.layers_front_to_rear()[0])
+    front = ~_is_rear(station)
     return np.asarray({"all": np.ones_like(front), "front": front, "rear": ~front}[scenario.lamps.layers])
 
 
@@ -324,7 +328,7 @@ def _dark(
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Which lights (N, M) make no spot although nothing hides them."""
-    front = station.layer == station.layers.index(station.layers_front_to_rear()[0])
+    front = ~_is_rear(station)
     count = rng.integers(*scenario.faults.missing, len(visible), endpoint=True)
     missing = _some(visible & front, count, rng)[course.missing_from]
     dropped = rng.random(visible.shape) < scenario.spots.drop
@@ -370,14 +374,20 @@ def _strays(
     return frame[clear], uv[clear]
 
 
-def _in_a_row(uv: Array, lit: np.ndarray, strays: tuple[Indices, Array], named: bool) -> _Spots:
+def _in_a_row(uv: Array, lit: np.ndarray, strays: tuple[Indices, Array], range_m: Array, named: bool) -> SpotTable:
     """The lit lights and the spurious spots, frame by frame; of lights that are not `named` none is known."""
     frame, light = np.nonzero(lit)
-    seen = np.concatenate([uv[frame, light], strays[1]])
-    light = np.concatenate([light if named else np.full(len(light), -1), np.full(len(strays[0]), -1)])
+    seen, nothing = np.concatenate([uv[frame, light], strays[1]]), np.full(len(strays[0]), -1)
+    far = np.concatenate([range_m[frame, light] if named else np.full(len(light), np.nan), nothing * np.nan])
+    light = np.concatenate([light if named else np.full(len(light), -1), nothing])
     frame = np.concatenate([frame, strays[0]])
     order = np.argsort(frame, kind="stable")
-    return _Spots(frame[order], seen[order], light[order])
+    return SpotTable(frame[order], seen[order], light[order], far[order])
+
+
+def _is_rear(station: Station) -> np.ndarray:
+    """Which lights (M,) are not of the front layer."""
+    return np.asarray(station.layer != station.layers.index(station.layers_front_to_rear()[0]))
 
 
 def _p_rear(scenario: Scenario, station: Station, light: Indices, rng: np.random.Generator) -> Array:
@@ -399,20 +409,28 @@ def _attitudes(scenario: Scenario, course: Course, rng: np.random.Generator) -> 
     return [Attitude(R, sigma_rad) for R in rotations(w) @ course.T_dock_cam[:, :3, :3]]
 
 
-def _ends(course: Course, spots: _Spots) -> list[int]:
+def _ends(course: Course, spots: SpotTable) -> list[int]:
     """Where each frame's spots begin, and the last ones end: N + 1 places in the row."""
     ends: list[int] = np.searchsorted(spots.frame, np.arange(len(course.t_ns) + 1)).tolist()
     return ends
 
 
 def _detections(
-    course: Course, spots: _Spots, uv: Array, p_rear: Array, attitudes: list[Attitude | None]
+    course: Course, spots: SpotTable, looks: Looks, attitudes: list[Attitude | None]
 ) -> Iterator[Detections]:
-    """One frame's detections after the other; they are views of the arrays `uv` (S, 2) and `p_rear` (S,)."""
-    unknown, sure, ends = np.full(len(uv), np.nan), np.ones(len(uv)), _ends(course, spots)
-    t_ns = course.t_ns.tolist()
+    """One frame's detections after the other; they are views of the arrays of all spots."""
+    uv, cov, p_light, p_rear = spots.uv + looks.off_px, looks.cov_px2, looks.p_light, looks.p_rear
+    unknown, ends, t_ns = np.full(len(uv), np.nan), _ends(course, spots), course.t_ns.tolist()
     for number, (a, b) in enumerate(pairwise(ends)):
-        nothing = unknown[a:b]
+        nothing, cov_px2 = unknown[a:b], None if cov is None else cov[a:b]
         yield Detections(
-            f"{number:06d}", t_ns[number], uv[a:b], nothing, nothing, sure[a:b], p_rear[a:b], None, attitudes[number]
+            f"{number:06d}",
+            t_ns[number],
+            uv[a:b],
+            nothing,
+            nothing,
+            p_light[a:b],
+            p_rear[a:b],
+            cov_px2,
+            attitudes[number],
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -51,9 +50,3 @@ def rows_of(knobs: Stream, t_ns: np.ndarray, rng: np.random.Generator) -> list[R
         if draw[3] < knobs.disordered and len(rows) > 1:
             rows[-2:] = [rows[-1], replace(rows[-2], fault=rows[-2].fault or "disordered")]
     return rows
-
-
-def cut(path: Path) -> None:
-    """Leave the first half of a file."""
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])

@@ -1,0 +1,115 @@
+"""Bare detections by a detector that errs as measured on rendered frames, and how that is measured."""
+
+import numpy as np
+import pytest
+from bench import detector_errors as bench
+from bench.shipped import shipped_camera, shipped_station
+
+from lumidock.datatypes import Detections
+from lumidock.errors import InputError
+from lumidock.sim.measured import KINDS, detector_errors, measured_like, measured_table
+from lumidock.sim.scenario import load_scenario, shipped_scenarios
+from lumidock.sim.spots import spot_frames
+
+STATION, CAMERA = shipped_station(), shipped_camera()
+REAR = STATION.layer != STATION.layers.index(STATION.layers_front_to_rear()[0])
+PATHS = [name for name in shipped_scenarios() if load_scenario(name).path.kind != "draws"]
+
+
+def frames_of(name, like, *settings, seed=5):
+    scenario = load_scenario(name, (f"spots.detector={like}", *settings))
+    return list(spot_frames(scenario, STATION, CAMERA, seed))
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_the_detector_was_measured_on_the_pictures_of_every_shipped_docking(name):
+    errors = detector_errors(measured_like(load_scenario(name)))
+    for kind in KINDS:
+        for cell in errors.cells[kind]:
+            assert np.isfinite(cell.spots[:, :3]).all()
+            assert cell.rate == 0.0 or len(cell.spots)
+            assert kind == "false" or cell.rate <= 1.0
+
+
+def test_pictures_that_were_not_measured_are_refused_in_one_line():
+    with pytest.raises(InputError, match="no detector errors"):
+        measured_like(load_scenario("approach", ("water.b_factor=1.7",)))
+    with pytest.raises(InputError, match=r"spots\.detector: mud is not measured; there are approach"):
+        frames_of("approach", "mud")
+
+
+@pytest.mark.parametrize("like", ["approach", "water-5c", "occluder"])
+def test_lights_are_found_and_false_spots_seen_as_often_as_measured(like):
+    """Counted from the frames alone, against the counts in the file."""
+    content, edges = measured_table()["scenarios"][like], measured_table()["edges_m"]
+    seen = {kind: np.zeros((len(edges), 2)) for kind in KINDS}
+    for seed in range(4):
+        for frame in frames_of("approach", like, seed=seed):
+            c_dock = frame.T_dock_cam[:3, 3]
+            far = np.searchsorted(edges, np.linalg.norm(STATION.p_dock - c_dock, axis=1), side="right") - 1
+            for i in np.flatnonzero(frame.in_view):
+                seen["rear" if REAR[i] else "front"][far[i]] += (1, i in frame.light)
+            dock = np.searchsorted(edges, np.linalg.norm(c_dock), side="right") - 1
+            seen["false"][dock] += (1, (frame.light < 0).sum())
+    for kind, counts in seen.items():
+        for (of, found), cell in zip(counts, content[kind], strict=True):
+            rate = cell["seen"] / max(cell["of"], 1)
+            sigma = np.sqrt(of * rate * ((1.0 - rate) if kind != "false" else 1.0))
+            assert abs(found - of * rate) <= 5.0 * sigma + 1e-9, (kind, of, found, rate)
+
+
+def test_spots_err_as_measured_over_their_own_covariance():
+    rows = measured_table()["scenarios"]["pool"]
+    wanted = {(spot[0], spot[1]) for kind in ("front", "rear") for cell in rows[kind] for spot in cell["spots"]}
+    got = []
+    for frame in frames_of("approach", "pool"):
+        d, lights = frame.detections, np.flatnonzero(frame.light >= 0)
+        sigma = np.sqrt(d.cov_px2[lights, 0, 0])
+        error = np.linalg.norm(d.uv[lights] - frame.uv[frame.light[lights]], axis=1)
+        got += zip(sigma, error / sigma, strict=True)
+    distance = np.abs(np.array(got)[:, None] - np.array(sorted(wanted))[None]).max(axis=2)
+    assert distance.min(axis=1).max() < 1e-6
+    assert len(set(distance.argmin(axis=1))) > 0.5 * len(wanted)
+
+
+def test_faults_of_the_scenario_stay_beside_the_detectors():
+    settings = ("faults.spurious=2", "spots.noise_px=0.25")
+    for frame in frames_of("approach", "approach", *settings):
+        d = frame.detections
+        strays = np.isclose(d.cov_px2[:, 0, 0], 0.0625) & (frame.light < 0) & (d.p_light == 1.0)
+        assert strays.sum() == 2
+    blind = frames_of("approach", "pool", "spots.black_outs.at_s=[[3.0, 4.0]]")
+    assert [len(f.detections) for f in blind if 3_000_000_000 <= f.detections.t_ns <= 4_000_000_000] == [0] * 7
+    dead = frames_of("approach", "water-ib", "lamps.failures={F1: 0.0}")
+    assert not any(STATION.ids.index("F1") in frame.light for frame in dead)
+
+
+def test_a_frame_is_counted_by_what_became_of_each_light():
+    cells = {kind: [bench.Cell() for _ in bench.EDGES_M] for kind in KINDS}
+    lit = np.array(  # u, v, range, whether rear, SNR
+        [
+            [100.0, 100.0, 7.0, 0, 9.0],
+            [640.0, 481.0, 7.0, 0, 3.0],  # does not stand out: the spot beside it is another's
+            [200.0, 200.0, 12.0, 1, 50.0],
+            [402.0, 400.0, 12.0, 1, 50.0],  # not found, but a hot pixel is
+        ]
+    )
+    uv = np.array([[103.0, 104.0], [200.0, 200.5], [500.0, 500.0], [640.0, 480.0], [400.0, 400.0]])
+    stray, hot = np.array([[500.0, 501.0]]), np.array([[200.0, 200.6], [400.0, 400.0]])
+    p_light, p_rear = np.array([0.9, 0.8, 1.0, 0.1, 0.2]), np.array([0.1, 0.2, 0.1, np.nan, 0.3])
+    found = Detections("0", 0, uv, np.ones(5), np.ones(5), p_light, p_rear, np.tile(np.diag([0.25, 0.25]), (5, 1, 1)))
+    bench.add(cells, found, lit, stray, hot, 7.0)
+    front, rear, false = cells["front"][1], cells["rear"][2], cells["false"][1]
+    assert (front.of, rear.of, false.of) == (2, 2, 1)
+    np.testing.assert_allclose(front.spots, [[0.5, 10.0, 0.9, 0.1]])
+    np.testing.assert_allclose(rear.spots, [[0.5, 1.0, 0.8, 0.2]])
+    np.testing.assert_allclose(false.spots, [[0.5, 0.0, 0.1, np.nan], [0.5, 0.0, 0.2, 0.3]])
+    assert false.as_dict()["spots"] == [[0.5, 0.0, 0.1, None], [0.5, 0.0, 0.2, 0.3]]
+
+
+def test_what_is_kept_of_many_spots_keeps_the_worst():
+    cell = bench.Cell(of=500, spots=[[0.3, float(k), 1.0, 0.1] for k in np.random.default_rng(1).permutation(400)])
+    kept = cell.as_dict()
+    assert (kept["of"], kept["seen"]) == (500, 400)
+    assert [kept["spots"][0][1], kept["spots"][-1][1]] == [0.0, 399.0]
+    assert len(kept["spots"]) < 30
