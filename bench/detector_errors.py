@@ -32,7 +32,7 @@ EDGES_M = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 _NEAR_PX = 6.0  # farther from its lamp a spot is a false one; less would hide the worst errors
 _ON_PX = 1.0  # so near to a hot pixel, and not to its lamp, it is the hot pixel that is seen
 _LEAST_SNR = 4.0
-_KEPT = 20  # spots of a cell that are written down
+_KEPT = {"front": 150, "rear": 150, "false": 30}  # spots of a cell that are written down: of lights all, here
 
 
 @dataclass
@@ -42,11 +42,11 @@ class Cell:
     of: int = 0
     spots: list[list[float]] = field(default_factory=list)
 
-    def as_dict(self) -> dict[str, Any]:
-        """For the file: spots by rising error (false ones: p_light), thinned out evenly so that both ends stay."""
+    def as_dict(self, most: int) -> dict[str, Any]:
+        """For the file: spots by rising error, false ones by p_light, thinned out evenly to `most`."""
         rows = sorted(self.spots, key=lambda row: row[1:3])
-        if len(rows) > _KEPT:
-            rows = [rows[i] for i in np.linspace(0, len(rows) - 1, _KEPT).round().astype(int)]
+        if len(rows) > most:
+            rows = [rows[i] for i in np.linspace(0, len(rows) - 1, most).round().astype(int)]
         kept = [[None if np.isnan(value) else float(f"{value:.3g}") for value in row] for row in rows]
         square = float(np.mean([row[1] ** 2 for row in self.spots])) if self.spots else 0.0
         return {"of": self.of, "seen": len(self.spots), "mean_square": float(f"{square:.3g}"), "spots": kept}
@@ -70,7 +70,7 @@ def add(cells: Cells, found: Detections, lit: Array, strays: Array, hot: Array, 
     owner = matches(found, np.concatenate([shows, strays]), _NEAR_PX)
     for i in np.flatnonzero((owner >= 0) & (owner < len(lit))):
         at_light, at_hot = (np.linalg.norm(uv - found.uv[i], axis=1) for uv in (lit[owner[i], None, :2], hot))
-        if at_hot.min(initial=np.inf) < _ON_PX < at_light[0]:
+        if at_light[0] > _NEAR_PX or at_hot.min(initial=np.inf) < _ON_PX < at_light[0]:
             owner[i] = -1
     for light in lit:
         cells["rear" if light[3] else "front"][band(light[2])].of += 1
@@ -135,7 +135,7 @@ def main() -> tuple[dict[str, object], list[str]]:
 
 def as_dict(cells: Cells) -> dict[str, Any]:
     """For the file."""
-    return {kind: [cell.as_dict() for cell in row] for kind, row in cells.items()}
+    return {kind: [cell.as_dict(_KEPT[kind]) for cell in row] for kind, row in cells.items()}
 
 
 def write(measured: dict[str, Any]) -> None:
