@@ -83,8 +83,9 @@ def add(cells: Cells, found: Detections, lit: Array, strays: Array, hot: Array, 
             cells["false"][band(np.array(dock_m))].spots.append([sigma_px, 0.0, *says])
         elif k < len(lit):
             e = found.uv[i] - lit[k, :2]
-            row = [sigma_px, float(np.sqrt(e @ np.linalg.solve(cov, e))), *says]
-            cells["rear" if lit[k, 3] else "front"][band(lit[k, 2])].spots.append(row)
+            over = float(np.sqrt(e @ np.linalg.solve(cov, e)))
+            along_px = float(np.linalg.norm(e)) / over if over > 0.0 else sigma_px  # of a covariance that is no circle
+            cells["rear" if lit[k, 3] else "front"][band(lit[k, 2])].spots.append([along_px, over, *says])
 
 
 def measure(scenario: Scenario) -> Cells:

@@ -97,12 +97,14 @@ def test_a_frame_is_counted_by_what_became_of_each_light():
     uv = np.array([[103.0, 104.0], [200.0, 200.5], [500.0, 500.0], [640.0, 480.0], [400.0, 400.0]])
     stray, hot = np.array([[500.0, 501.0]]), np.array([[200.0, 200.6], [400.0, 400.0]])
     p_light, p_rear = np.array([0.9, 0.8, 1.0, 0.1, 0.2]), np.array([0.1, 0.2, 0.1, np.nan, 0.3])
-    found = Detections("0", 0, uv, np.ones(5), np.ones(5), p_light, p_rear, np.tile(np.diag([0.25, 0.25]), (5, 1, 1)))
+    cov = np.tile(np.diag([0.25, 0.25]), (5, 1, 1))
+    cov[1] = np.diag([0.01, 1.0])  # its error is along v
+    found = Detections("0", 0, uv, np.ones(5), np.ones(5), p_light, p_rear, cov)
     bench.add(cells, found, lit, stray, hot, 7.0)
     front, rear, false = cells["front"][1], cells["rear"][2], cells["false"][1]
     assert (front.of, rear.of, false.of) == (2, 2, 1)
     np.testing.assert_allclose(front.spots, [[0.5, 10.0, 0.9, 0.1]])
-    np.testing.assert_allclose(rear.spots, [[0.5, 1.0, 0.8, 0.2]])
+    np.testing.assert_allclose(rear.spots, [[1.0, 0.5, 0.8, 0.2]])
     np.testing.assert_allclose(false.spots, [[0.5, 0.0, 0.1, np.nan], [0.5, 0.0, 0.2, 0.3]])
     assert false.as_dict(20)["spots"] == [[0.5, 0.0, 0.1, None], [0.5, 0.0, 0.2, 0.3]]
 
