@@ -52,7 +52,7 @@ class Cell:
     """One kind of spot in one band of range.
 
     `rate`: the share of lights that are found, or false spots a frame; `spots` (K, 4) found ones: sigma px along the
-    error by the detector's covariance, error of the centre over that (0 for false ones), p_light, p_rear (NaN: unknown).
+    error by the covariance, error of the centre over that (0 for false ones), p_light, and p_rear (NaN: unknown).
     """
 
     rate: float
