@@ -32,7 +32,7 @@ def belief(T_dock_cam, P6, *, lights=4, log_weight=0.0, apart=None):
     apart = np.zeros((M, 18)) if apart is None else apart
     R, t = np.ascontiguousarray(T_cam_dock[:3, :3]), np.ascontiguousarray(T_cam_dock[:3, 3])
     never = np.zeros(2, np.int64)
-    return Track(0, 0, R, t, x, P, False, log_weight, 2, 0, never, name, apart, NO_PLANE, 1.0, 0.0, 0.0)
+    return Track(0, 0, R, t, x, P, False, log_weight, 2, 0, 0, never, name, apart, NO_PLANE, 1.0, 0.0, 0.0)
 
 
 def at(z, rng=None):
