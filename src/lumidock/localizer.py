@@ -205,7 +205,7 @@ class Localizer:
         if not begun:
             return False
         self.beliefs = self._likeliest([*(replace(b, log_weight=head.log_evidence) for b in held), *begun])
-        self.locked, self.margin = True, found.margin
+        self.locked, self.margin = True, max(found.margin - found.crowding, self.config.match.margin)
         return True
 
     def _begin(self, namings: list[Hypothesis], detections: Detections, seen: Spots) -> list[Track]:

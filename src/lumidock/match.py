@@ -80,7 +80,8 @@ class Hypothesis:
 class Acquisition:
     """The best hypothesis first, without its doubtful names, and all that fit, with them.
 
-    `margin` is the log odds of its names against all others.
+    `margin` is the log odds of its names against all others; `crowding` how much less sure they are, as a logarithm,
+    for the spots that stand around them.
     `others` are the other poses that the best names fit, where a plane leaves two. `reason` says why it is no answer.
     """
 
@@ -88,6 +89,7 @@ class Acquisition:
     others: tuple[Hypothesis, ...]
     margin: float
     reason: str = ""
+    crowding: float = 0.0
 
 
 def plan(station: Station, camera: Camera, config: MatchConfig) -> Plan:
@@ -330,7 +332,9 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
     top = _polish(ask, listed.names[0], listed.Rs[0], listed.ts[0], float(listed.scores[0]))
     others = [pose for pose in (_other_pose(ask, top, level=level) for level in (False, True)) if pose is not None]
     best = max([top.score, *(score for _, score in others)])  # they share most of their mass
-    kept = _kept(top, best, listed, _crowding(top.name, found, plan, config), plan, config)
+    strays, area = _strays(top.name, found)
+    crowding = _crowding(strays, area, plan, config)
+    kept = _kept(top, best, listed, crowding, plan, config)
     conflicting = listed.scores[conflicts(kept, listed.names)]
     mirror = _mirror_evidence(ask, top)
     against = float(np.logaddexp.reduce([-config.log_dock, mirror, *top.against[kept >= 0], *conflicting]))
@@ -343,7 +347,7 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
     direct = float(np.logaddexp.reduce([_NONE, *listed.scores[(listed.names != top.name).any(axis=1)]]))
     reason = "mirror" if mirror > max(best - config.margin, direct) else "ambiguous"
     same = tuple(Hypothesis(kept, T_cam_dock, score) for T_cam_dock, score in others)
-    return Acquisition((head, *rest), same, best - against, reason)
+    return Acquisition((head, *rest), same, best - against, reason, crowding if strays else 0.0)
 
 
 def _other_pose(ask: _Question, top: _Polished, *, level: bool) -> tuple[Array, float] | None:
@@ -387,13 +391,18 @@ def _kept(top: _Polished, best: float, listed: _Found, crowding: float, plan: Pl
     return np.where(weak[plan.layer], -1, kept)
 
 
-def _crowding(name: Indices, found: Spots, plan: Plan, config: MatchConfig) -> float:
-    """How much denser, as a logarithm >= 0, unnamed spots stand around the named ones than the evidence has it."""
+def _strays(name: Indices, found: Spots) -> tuple[int, float]:
+    """How many unnamed spots stand around the named ones, and the area px^2 that they stand in."""
     used = found.uv[name[name >= 0]]
     low, high = used.min(axis=0), used.max(axis=0)
     low, high = low - 0.25 * (high - low), high + 0.25 * (high - low)
     inside = int(((found.uv >= low) & (found.uv <= high)).all(axis=1).sum()) - len(used)
-    local = (inside + 0.5) / float((high - low).prod() + 1.0)
+    return inside, float((high - low).prod()) + 1.0
+
+
+def _crowding(strays: int, area: float, plan: Plan, config: MatchConfig) -> float:
+    """How much denser, as a logarithm >= 0, unnamed spots stand around the named ones than the evidence has it."""
+    local = (strays + 0.5) / area
     return max(0.0, math.log(local * plan.lens[6] * plan.lens[7] / config.spurious))
 
 
