@@ -187,7 +187,7 @@ class MatchConfig(Section):
     """Cold start: the evidence and the decision."""
 
     noise_px: PositiveFloat = 0.5  # of a centre that comes without a covariance
-    strange: Fraction = 0.5  # 1 sigma, of its radius, of the centre of a spot that looks nothing like a lamp
+    strange: Fraction = 0.5  # 1 sigma, of its radius, of the centre of a spot that is all but surely no lamp
     detect: Annotated[float, Field(gt=0, lt=1)] = 0.8  # probability that a light in view is detected
     layer_absent: Annotated[float, Field(gt=0, lt=1)] = 0.3  # that a layer is not seen at all
     steady: Annotated[float, Field(ge=0, lt=1)] = 0.7  # share of vehicles that hold head-on better than the prior ...

@@ -26,8 +26,8 @@ _HEAD_ON = np.diag([1.0, -1.0, -1.0])
 _MIRROR = np.array([1.0, -1.0, 1.0])  # the water's surface is level, and so is dock x, z
 _NONE = -1e300
 _MAX_RELABELLINGS = 4
-_LAMP, _LAMP_LIKE = 0.5, 0.9
-_RADIUS_PX = 3.0  # of a spot that comes without one
+_LAMP, _STRANGE = 0.5, 0.15  # of the probabilities to be one
+_RADIUS_PX = 3.0  # of a spot that comes without one; a larger one says no more
 _OPEN_ROLL = math.radians(45.0)  # 1 sigma; of a roll less known than this a steady vehicle says nothing
 _FLAT = 0.05  # a layer less thick than this share of its width is a plane
 
@@ -197,12 +197,12 @@ class Spots:
 def spots(detections: Detections, plan: Plan, config: MatchConfig) -> Spots:
     """What the evidence needs to know of a frame's detections; centres without a covariance get the configured one.
 
-    A spot that looks less like a lamp may be more, or less, than one: its centre is worth a share of its radius.
+    A spot that looks like no lamp may be more, or less, than one: its centre is worth a share of its radius.
     """
     uv, n = np.ascontiguousarray(detections.uv), len(detections)
     p_light = np.where(np.isnan(detections.p_light), 1.0, detections.p_light)
-    radius_px = np.where(np.isnan(detections.radius_px), _RADIUS_PX, detections.radius_px)
-    strange_px = config.strange * np.maximum(_LAMP_LIKE - p_light, 0.0) * radius_px
+    radius_px = np.fmin(detections.radius_px, _RADIUS_PX)
+    strange_px = config.strange * np.maximum(1.0 - p_light / _STRANGE, 0.0) * radius_px
     cov = np.empty((n, 2, 2))
     cov[:] = np.eye(2) * config.noise_px**2 if detections.cov_px2 is None else detections.cov_px2
     cov += (strange_px**2)[:, None, None] * np.eye(2)
