@@ -127,14 +127,24 @@ class Localizer:
         self.locked = False
 
     def _follow(self, beliefs: list[Track], seen: Spots) -> list[Track]:
-        """The beliefs that find lights in this frame, with these taken in, the likeliest first."""
-        followed = []
+        """The beliefs that find lights in this frame, with these taken in, the likeliest first.
+
+        None where one as likely as these cannot be judged: what is left would win for want of a rival.
+        """
+        followed, lost = [], -math.inf
         for belief in beliefs:
             found = track.associate(belief, seen, self._plan, self.config)
             if (found.name >= 0).any():
                 weighed = replace(belief, log_weight=belief.log_weight + found.log_evidence)
-                followed.append(track.update(weighed, found.name, seen, self._plan, self.config.track))
-        return self._likeliest([belief for belief in followed if belief is not None])
+                updated = track.update(weighed, found.name, seen, self._plan, self.config.track)
+                if updated is None:
+                    lost = max(lost, weighed.log_weight)
+                else:
+                    followed.append(updated)
+            elif found.log_evidence == -math.inf:
+                lost = math.inf
+        kept = self._likeliest(followed)
+        return kept if kept and kept[0].log_weight - lost > self.config.track.forget else []
 
     def _likeliest(self, beliefs: list[Track]) -> list[Track]:
         """The likeliest first, without those that are out of the question or the same as a likelier one."""
