@@ -78,6 +78,8 @@ class Localizer:
         self.beliefs = self._predict(before, detections)
         if not self.beliefs:
             self._lose(before)
+        elif self.beliefs[0].proof == 0:  # what one frame once decided no longer stands for the names
+            self.margin = min(self.margin, self.config.integrity.evidence)
         if reason:
             return self._no_fix(detections, "coasting" if self.locked else "none", reason)
         return self._localize(detections)
@@ -129,21 +131,26 @@ class Localizer:
     def _follow(self, beliefs: list[Track], seen: Spots) -> list[Track]:
         """The beliefs that find lights in this frame, with these taken in, the likeliest first.
 
-        None where one as likely as these cannot be judged: what is left would win for want of a rival.
+        One whose pose does not settle cannot be judged, and the others must not win for want of it: before a lock it is
+        kept as it was predicted; after one, where it is as likely as the others, none is followed.
         """
-        followed, lost = [], -math.inf
+        followed, unjudged = [], []
         for belief in beliefs:
             found = track.associate(belief, seen, self._plan, self.config)
-            if (found.name >= 0).any():
-                weighed = replace(belief, log_weight=belief.log_weight + found.log_evidence)
-                updated = track.update(weighed, found.name, seen, self._plan, self.config.track)
-                if updated is None:
-                    lost = max(lost, weighed.log_weight)
-                else:
-                    followed.append(updated)
-            elif found.log_evidence == -math.inf:
-                lost = math.inf
+            if found.log_evidence == -math.inf:
+                return []
+            if not (found.name >= 0).any():
+                continue
+            weighed = replace(belief, log_weight=belief.log_weight + found.log_evidence)
+            updated = track.update(weighed, found.name, seen, self._plan, self.config.track)
+            if updated is None:
+                unjudged.append(replace(weighed, name=found.name))
+            else:
+                followed.append(updated)
+        if not self.locked:
+            return self._likeliest([*followed, *unjudged])
         kept = self._likeliest(followed)
+        lost = max((belief.log_weight for belief in unjudged), default=-math.inf)
         return kept if kept and kept[0].log_weight - lost > self.config.track.forget else []
 
     def _likeliest(self, beliefs: list[Track]) -> list[Track]:
@@ -210,8 +217,9 @@ class Localizer:
             self._slow = track.learned(self.beliefs[0])
         begun = self._begin(namings, detections, seen)
         if not begun and self._slow is not None:  # what an earlier track has learned may be wrong
-            self._slow = None
+            learned, self._slow = self._slow, None
             begun = self._begin(namings, detections, seen)
+            self._slow = None if begun else learned
         if not begun:
             return False
         self.beliefs = self._likeliest([*(replace(b, log_weight=head.log_evidence) for b in held), *begun])
@@ -251,7 +259,7 @@ class Localizer:
         begun = self._start(naming, detections, seen)
         before = next((belief for belief in followed if (belief.name == naming.name).all()), None)
         if begun is None or before is None:
-            return begun
+            return begun or before
         best = max(other.log_evidence for other in new if (other.name == naming.name).all())
         weight = before.log_weight + naming.log_evidence - best
         return replace(begun, log_weight=weight, began_ns=before.began_ns, proof=before.proof)
@@ -260,8 +268,6 @@ class Localizer:
         """The fix of the likeliest belief, as far as it can be trusted."""
         first, config = self.beliefs[0], self.config.integrity
         bound = integrity.bounds(self.beliefs, config)
-        if first.proof == 0:  # what one frame once decided no longer stands for the names
-            self.margin = min(self.margin, config.evidence)
         proven = verify.is_proven(first, self.margin, config)
         valid = proven and integrity.pose_holds(bound)
         self._stage = integrity.stage(first, self._plan) or self._stage
@@ -287,7 +293,6 @@ class Localizer:
         self.beliefs = [replace(b, name=nothing, proof=0 if reason == "residual" else b.proof) for b in self.beliefs]
         age_s = (detections.t_ns - self.beliefs[0].lights_ns) * 1e-9
         if self.beliefs[0].proof == 0:  # nothing has agreed since a test failed
-            self.margin = min(self.margin, self.config.integrity.evidence)
             return self._no_fix(detections, "coasting", "residual")
         if age_s > self.config.integrity.max_age_s:
             return self._no_fix(detections, "coasting", "stale")
