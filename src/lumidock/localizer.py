@@ -223,7 +223,7 @@ class Localizer:
         if not begun:
             return False
         self.beliefs = self._likeliest([*(replace(b, log_weight=head.log_evidence) for b in held), *begun])
-        self.locked, self.margin = True, max(found.margin - found.crowding, self.config.match.margin)
+        self.locked, self.margin = True, max(found.certainty, self.config.match.margin)
         return True
 
     def _begin(self, namings: list[Hypothesis], detections: Detections, seen: Spots) -> list[Track]:

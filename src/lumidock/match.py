@@ -80,8 +80,8 @@ class Hypothesis:
 class Acquisition:
     """The best hypothesis first, without its doubtful names, and all that fit, with them.
 
-    `margin` is the log odds of its names against all others; `crowding` how much less sure they are, as a logarithm,
-    for the spots that stand around them.
+    `margin` is the log odds of its names against all others; `certainty` what of it may stand for the stated risk: less
+    among spots that crowd around them, and no more than a lock needs where one name alone is in doubt.
     `others` are the other poses that the best names fit, where a plane leaves two. `reason` says why it is no answer.
     """
 
@@ -89,7 +89,7 @@ class Acquisition:
     others: tuple[Hypothesis, ...]
     margin: float
     reason: str = ""
-    crowding: float = 0.0
+    certainty: float = 0.0
 
 
 def plan(station: Station, camera: Camera, config: MatchConfig) -> Plan:
@@ -334,7 +334,8 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
     best = max([top.score, *(score for _, score in others)])  # they share most of their mass
     strays, area = _strays(top.name, found)
     crowding = _crowding(strays, area, plan, config)
-    kept = _kept(top, best, listed, crowding, plan, config)
+    odds = _odds(top, best, listed, crowding)
+    kept = _kept(top.name, odds, plan, config)
     conflicting = listed.scores[conflicts(kept, listed.names)]
     mirror = _mirror_evidence(ask, top)
     against = float(np.logaddexp.reduce([-config.log_dock, mirror, *top.against[kept >= 0], *conflicting]))
@@ -347,7 +348,10 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
     direct = float(np.logaddexp.reduce([_NONE, *listed.scores[(listed.names != top.name).any(axis=1)]]))
     reason = "mirror" if mirror > max(best - config.margin, direct) else "ambiguous"
     same = tuple(Hypothesis(kept, T_cam_dock, score) for T_cam_dock, score in others)
-    return Acquisition((head, *rest), same, best - against, reason, crowding if strays else 0.0)
+    margin = best - against
+    doubtful = bool((odds[kept >= 0] < config.margin_gathered).any())
+    certainty = min(margin - (crowding if strays else 0.0), config.margin if doubtful else math.inf)
+    return Acquisition((head, *rest), same, margin, reason, certainty)
 
 
 def _other_pose(ask: _Question, top: _Polished, *, level: bool) -> tuple[Array, float] | None:
@@ -374,18 +378,22 @@ def _renamed(found: Acquisition, detections: Indices) -> Acquisition:
     return replace(found, candidates=tuple(map(of_all, found.candidates)), others=tuple(map(of_all, found.others)))
 
 
-def _kept(top: _Polished, best: float, listed: _Found, crowding: float, plan: Plan, config: MatchConfig) -> Indices:
+def _odds(top: _Polished, best: float, listed: _Found, crowding: float) -> Array:
+    """Log odds (M,) of each name against all that leave its detection out or name its light otherwise."""
+    elsewhere = np.where(listed.names != top.name, listed.scores[:, None], _NONE)
+    # most relabellings are in the list as well: counted once
+    doubt = np.logaddexp(top.without + crowding, np.maximum(top.against, np.logaddexp.reduce(elsewhere)))
+    return np.where(top.name >= 0, best - doubt, _NONE)
+
+
+def _kept(name: Indices, odds: Array, plan: Plan, config: MatchConfig) -> Indices:
     """The naming (M,) without what is not beyond doubt: single names, and layers with too few of them.
 
     The names beyond doubt stay; where they are fewer than `enough`, the likeliest of the others fill up.
     """
-    elsewhere = np.where(listed.names != top.name, listed.scores[:, None], _NONE)
-    # most relabellings are in the list as well: counted once
-    doubt = np.logaddexp(top.without + crowding, np.maximum(top.against, np.logaddexp.reduce(elsewhere)))
-    odds = np.where(top.name >= 0, best - doubt, _NONE)
     likeliest = np.sort(odds)[::-1]
     least = max(min(config.extra, float(likeliest[min(config.enough, len(odds)) - 1])), config.prune)
-    kept = np.where(odds >= least, top.name, -1)
+    kept = np.where(odds >= least, name, -1)
     count = np.bincount(plan.layer[kept >= 0], minlength=plan.n_layers)
     weak = (count < config.min_layer) & (count < count.max())
     return np.where(weak[plan.layer], -1, kept)
