@@ -10,7 +10,9 @@ from numpy.testing import assert_array_equal
 from scipy.stats import multivariate_normal
 
 from lumidock import integrity, match, track, trust
+from lumidock._kernels import association
 from lumidock._kernels import track as kernel
+from lumidock._kernels.levels import outputs
 from lumidock.camera import load_camera
 from lumidock.config import Config
 from lumidock.datatypes import Attitude, Detections
@@ -249,7 +251,7 @@ def test_leaving_a_light_out_does_what_apart_says(rng):
     uv = pixels(before.T_cam_dock, before.x, BOTH) + rng.normal(0, 0.1, (M, 2))
     seen = spots_at(uv)
     full = track.update(before, named(BOTH), seen, PLAN, CONFIG.track)
-    C = kernel.outputs(full.R, full.t)
+    C = outputs(full.R, full.t)
 
     def nine(b):
         return C @ b.P[:6, :6] @ C.T
@@ -271,9 +273,9 @@ def test_moving_dock_and_lights_together_changes_no_pixel(rng):
     belief = begun(head_on(), BOTH, rng)
 
     def look(b):
-        expected, S, shown = np.zeros((M, 2)), np.zeros((2 * M, 2 * M)), np.empty(M)
-        kernel.look(PLAN.lens, b.R, b.t, b.x, b.P, PLAN.p_dock, PLAN.axis, expected, S, shown)
-        return expected, S, shown
+        foreseen = kernel.Foreseen(np.zeros((M, 2)), np.zeros((2 * M, 2 * M)), np.empty(M))
+        kernel.look(PLAN.lens, kernel.State(b.R, b.t, b.x, b.P), PLAN.p_dock, PLAN.axis, foreseen)
+        return foreseen
 
     expected, S, shown = look(belief)
     assert (shown > 0).all()
@@ -355,9 +357,9 @@ def associate(problem, gate=1e12, reach=12.0, max_nodes=1_000_000):
     m = len(expected)
     names, costs = np.full((8, m), -1, np.int64), np.empty(8)
     layer = np.zeros(m, np.int64)
-    found = kernel.associate(
-        expected, S, shown, layer, uv, var, like, log_clutter, detect, gate, reach, max_nodes, names, costs
-    )
+    foreseen = kernel.Foreseen(expected, S, shown)
+    terms = association.Terms(log_clutter, detect, gate, reach, max_nodes)
+    found = association.associate(foreseen, layer, uv, var, like, terms, names, costs)
     return found, names, costs
 
 

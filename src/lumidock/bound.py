@@ -12,6 +12,9 @@ import numpy as np
 
 from lumidock import match, track
 from lumidock._kernels import track as kernel
+from lumidock._kernels.levels import levels
+from lumidock._kernels.track import State
+from lumidock._kernels.update import Pixels, take_in
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Indices
@@ -64,9 +67,7 @@ class Bound:
             return None  # three lights fit many poses
         nothing = np.zeros((len(self.station), 18))
         return np.array(
-            kernel.levels(
-                R, t, self._P, nothing, track.NO_PLANE, self._factors, self._factors, False, np.empty((9, 9))
-            )[:3]
+            levels(R, t, self._P, nothing, track.NO_PLANE, self._factors, self._factors, False, np.empty((9, 9)))[:3]
         )
 
     def owes(self, t_ns: int, T_dock_cam: Array, lights: Indices) -> bool:
@@ -103,18 +104,13 @@ class Bound:
         cov = np.tile(np.eye(2) * self.config.match.noise_px**2, (len(lights), 1, 1))
         self._joint = self._joint or track.is_joint(name, self._plan, self.config.track)
         n = len(self._P) if self._joint else kernel.CALIBRATION
-        kernel.update(
+        take_in(
             self._plan.lens,
+            self._plan.p_dock,
             R,
             t,
-            R.copy(),
-            t.copy(),
-            np.zeros(len(self._P)),
-            self._P,
-            self._plan.p_dock,
-            name,
-            uv,
-            cov,
+            State(R.copy(), t.copy(), np.zeros(len(self._P)), self._P),
+            Pixels(name, uv, cov),
             n,
             1,
             track.NO_PLANE,

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from lumidock._kernels import track as kernel
+from lumidock._kernels.levels import levels
 from lumidock.config import IntegrityConfig
 from lumidock.datatypes import Array, Guide, Protection, Stage
 from lumidock.match import Plan
@@ -93,7 +93,7 @@ def _levels(track: Track, config: IntegrityConfig, cov: Array) -> Array:
     used = track.n_used
     fault_risk = min(config.risk / (config.fault * max(used, 1)), 0.5)
     return np.array(
-        kernel.levels(
+        levels(
             track.R,
             track.t,
             track.P,

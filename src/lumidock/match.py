@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lumidock._kernels import evidence as kernel
-from lumidock._kernels.evidence import Expected, Lights, Seen
+from lumidock._kernels.evidence import Expected, Lights, Naming, Scene, Seen
 from lumidock._kernels.rivals import other_pose, rivals
-from lumidock._kernels.search import Best, Goal, Listed, search
+from lumidock._kernels.search import Goal, Listed, search
 from lumidock.camera import Camera
 from lumidock.config import MatchConfig, PriorConfig
 from lumidock.datatypes import Array, Attitude, Detections, Indices
@@ -207,7 +207,8 @@ def spots(detections: Detections, plan: Plan, config: MatchConfig) -> Spots:
     cov[:] = np.eye(2) * config.noise_px**2 if detections.cov_px2 is None else detections.cov_px2
     cov += (strange_px**2)[:, None, None] * np.eye(2)
     var, like = np.empty(n), np.empty((n, plan.n_layers))
-    span = kernel.weigh(uv, cov, detections.p_rear, detections.p_light, plan.is_rear, config.label_trust, like, var)
+    p_rear, lamp = np.ascontiguousarray(detections.p_rear), np.ascontiguousarray(detections.p_light)
+    span = kernel.weigh(uv, cov, p_rear, lamp, plan.is_rear, config.label_trust, like, var)
     whole, share = plan.lens[6] * plan.lens[7], config.clutter_near
     box = min(span + config.clutter_margin_px**2, whole) if n else whole
     density = (1.0 - share) / whole + share / box
@@ -240,13 +241,18 @@ class _Question:
     plan: Plan
     config: MatchConfig
 
+    def scene(self, lights: Lights) -> Scene:
+        """The frame with these lights, or their mirror images, in it."""
+        return Scene(lights, self.seen, self.expected)
+
 
 def _question(plan: Plan, found: Spots, camera: Camera, expected: Prior, config: MatchConfig) -> _Question:
     offset = (found.uv - plan.lens[3:5]) * (0.5 * plan.sigma_focal)
     var = found.var + (offset**2).sum(axis=1)
     tilt_var, roll_sigma = float(1.0 / expected.info[:2].min()), float(expected.info[2] ** -0.5)
     q = _parameters(plan, config, tilt_var, roll_sigma, mixed=not expected.measured)
-    seen = Seen(found.uv, camera.unproject(found.uv), var, float(var.max(initial=0.0)), found.like, _log_clutter(found))
+    by_u, loosest = np.argsort(found.uv[:, 0]), float(var.max(initial=0.0))
+    seen = Seen(found.uv, by_u, camera.unproject(found.uv), var, loosest, found.like, _log_clutter(found))
     steady = expected.info * config.steadier**2
     if roll_sigma > _OPEN_ROLL:
         steady[2] = expected.info[2]
@@ -279,7 +285,7 @@ def _search(ask: _Question, lights: Lights, floor: int, *leasts: int, best: floa
     for least in leasts:
         bounds = np.array([least, floor, floor, floor - 1 if floor > least else 0])
         goal = Goal(bounds, budget, np.array([max(best, listed.scores[:count].max(initial=_NONE))]))
-        count = search(lights, ask.seen, ask.expected, plan.pairs, plan.unseen, goal, count, listed)
+        count = search(ask.scene(lights), plan.pairs, plan.unseen, goal, count, listed)
         sure = count > 0 and listed.scores[:count].max() > ask.config.sure
         if sure or len(ask.seen.uv) > ask.config.max_spots_three:
             break
@@ -302,16 +308,20 @@ class _Polished:
 
 def _polish(ask: _Question, name: Indices, R: Array, t: Array, score: float) -> _Polished:
     """Follow the best relabelling as long as it is better."""
-    m = len(name)
+    m, scene = len(name), ask.scene(ask.plan.direct)
     for _ in range(_MAX_RELABELLINGS):
         without, against = np.empty(m), np.empty(m)
-        better = Best(np.empty(m, np.int64), np.empty((3, 3)), np.empty(3))
-        taken = light_of(name, len(ask.seen.uv))
-        best = rivals(name, taken, ask.plan.direct, ask.seen, ask.expected, R, t, without, against, better)
+        better, taken = _no_naming(m), light_of(name, len(ask.seen.uv))
+        best = rivals(Naming(name, R, t), taken, scene, without, against, better)
         if best <= score:
             break
         name, R, t, score = *better, best
     return _Polished(name, R, t, score, without, against)
+
+
+def _no_naming(m: int) -> Naming:
+    """Room for a hypothesis of `m` lights."""
+    return Naming(np.empty(m, np.int64), np.empty((3, 3)), np.empty(3))
 
 
 def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: MatchConfig) -> Acquisition:
@@ -356,9 +366,9 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
 
 def _other_pose(ask: _Question, top: _Polished, *, level: bool) -> tuple[Array, float] | None:
     """Another pose of the best names, if there is one nearly as good, and its log evidence."""
-    R2, t2 = np.empty((3, 3)), np.empty(3)
-    score = other_pose(top.name, ask.plan.direct, ask.seen, ask.expected, level, top.R, top.t, R2, t2)
-    return (_pose(R2, t2), float(score)) if score > top.score - ask.config.keep else None
+    other = _no_naming(len(top.name))
+    score = other_pose(Naming(top.name, top.R, top.t), ask.scene(ask.plan.direct), level, other)
+    return (_pose(other.R, other.t), float(score)) if score > top.score - ask.config.keep else None
 
 
 def _likeliest(found: Spots, most: int) -> Indices | None:

@@ -158,7 +158,7 @@ def _flipped(T_dock_cam: Array, p_dock: Array) -> Array:
     """The other pose from which a plane seen from afar looks nearly the same."""
     T_cam_dock = se3_inverse(T_dock_cam)
     R, t = np.ascontiguousarray(T_cam_dock[:3, :3]), T_cam_dock[:3, 3].copy()
-    flip(np.ascontiguousarray(p_dock), len(p_dock), R, t)
+    flip(np.ascontiguousarray(p_dock), R, t)
     T_cam_dock[:3, :3], T_cam_dock[:3, 3] = R, t
     return se3_inverse(T_cam_dock)
 

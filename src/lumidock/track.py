@@ -11,7 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lumidock._kernels import association
 from lumidock._kernels import track as kernel
+from lumidock._kernels.track import Foreseen, State
+from lumidock._kernels.update import Pixels, take_in
 from lumidock.config import Config, TrackConfig
 from lumidock.datatypes import Array, Attitude, Indices
 from lumidock.match import Plan, Prior, Spots
@@ -170,13 +173,19 @@ def attend(track: Track, attitude: Attitude) -> Track:
 
 def foresee(track: Track, plan: Plan) -> Array:
     """Where the lights of a predicted track will be seen: (n, 3) u, v and reach, four sigmas and a margin, px."""
-    m = len(plan.p_dock)
-    expected, S, shown = np.empty((m, 2)), np.empty((2 * m, 2 * m)), np.empty(m)
-    kernel.look(plan.lens, track.R, track.t, track.x, track.P, plan.p_dock, plan.axis, expected, S, shown)
+    expected, S, shown = _look(track, plan)
     variance = np.diagonal(S)
     reach = 4.0 * np.sqrt(np.maximum(np.maximum(variance[::2], variance[1::2]), 0.0)) + _MARGIN_PX
     seen = (shown > 0.0) & np.isfinite(expected).all(axis=1) & np.isfinite(reach)
     return np.column_stack([expected, np.minimum(reach, _MAX_REACH_PX)])[seen]
+
+
+def _look(track: Track, plan: Plan) -> Foreseen:
+    """Where the lights are expected."""
+    m = len(plan.p_dock)
+    foreseen = Foreseen(np.empty((m, 2)), np.empty((2 * m, 2 * m)), np.empty(m))
+    kernel.look(plan.lens, State(track.R, track.t, track.x, track.P), plan.p_dock, plan.axis, foreseen)
+    return foreseen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,13 +202,11 @@ def associate(track: Track, seen: Spots, plan: Plan, config: Config) -> Associat
     A layer that was not in view enters with three lights or more, or not at all: where the tilt is open, a stray spot
     in the wide gate of a single light would set it.
     """
-    m = len(plan.p_dock)
-    expected, S, shown = np.empty((m, 2)), np.empty((2 * m, 2 * m)), np.empty(m)
-    kernel.look(plan.lens, track.R, track.t, track.x, track.P, plan.p_dock, plan.axis, expected, S, shown)
+    foreseen = _look(track, plan)
     known = (track.t_ns - track.layer_ns <= config.track.max_gap_s * 1e9)[plan.layer]
-    best = _search(expected, S, np.where(known, shown, 0.0), seen, plan, config)
-    if not known.all() and shown[~known].any():
-        wider = _search(expected, S, shown, seen, plan, config)
+    best = _search(foreseen._replace(shown=np.where(known, foreseen.shown, 0.0)), seen, plan, config)
+    if not known.all() and foreseen.shown[~known].any():
+        wider = _search(foreseen, seen, plan, config)
         new = np.bincount(plan.layer[(wider.name >= 0) & ~known], minlength=plan.n_layers)
         enters = (new == 0) | (new >= LAYER_LIGHTS)
         if new.any() and enters.all() and wider.log_evidence + config.track.log_appear > best.log_evidence:
@@ -207,26 +214,13 @@ def associate(track: Track, seen: Spots, plan: Plan, config: Config) -> Associat
     return best
 
 
-def _search(expected: Array, S: Array, shown: Array, seen: Spots, plan: Plan, config: Config) -> Association:
+def _search(foreseen: Foreseen, seen: Spots, plan: Plan, config: Config) -> Association:
     """The best naming, without names that another nearly as good does not have; none where they are too many."""
-    m = len(shown)
+    m = len(foreseen.shown)
     names, costs = np.full((_LEAVES, m), -1, np.int64), np.empty(_LEAVES)
-    found = kernel.associate(
-        expected,
-        S,
-        shown,
-        plan.layer,
-        seen.uv,
-        seen.var,
-        seen.like,
-        seen.log_density,
-        config.match.detect,
-        config.track.gate,
-        config.track.reach,
-        config.track.max_nodes,
-        names,
-        costs,
-    )
+    how = config.track
+    terms = association.Terms(seen.log_density, config.match.detect, how.gate, how.reach, how.max_nodes)
+    found = association.associate(foreseen, plan.layer, seen.uv, seen.var, seen.like, terms, names, costs)
     if found < 0:
         return Association(np.full(m, -1, np.int64), -np.inf)
     name, worth = names[0], -costs[:found]
@@ -256,18 +250,13 @@ def update(
     R0, t0, x, P = track.R, track.t, track.x.copy(), track.P.copy()
     R, t = (track.R.copy(), track.t.copy()) if at is None else (at[:3, :3].copy(), at[:3, 3].copy())
     apart, plane = np.zeros((len(name), 18)), _plane(name, plan, joint=track.joint)
-    nis = kernel.update(
+    nis = take_in(
         plan.lens,
+        plan.p_dock,
         R0,
         t0,
-        R,
-        t,
-        x,
-        P,
-        plan.p_dock,
-        name,
-        seen.uv,
-        seen.cov,
+        State(R, t, x, P),
+        Pixels(name, seen.uv, seen.cov),
         len(P) if joint else kernel.CALIBRATION,
         _TRACK_STEPS if at is None else _SOLVE_STEPS,
         NO_PLANE if at is not None and turn_cov is None else plane,

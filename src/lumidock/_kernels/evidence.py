@@ -1,12 +1,9 @@
-"""How probable a naming of one frame's detections is, with the pose integrated out.
-
-A hypothesis is `name` (M,): the detection that each light is given, or -1; and its pose `R`, `t` of T_cam_dock.
-"""
+"""How probable a naming of one frame's detections is, with the pose integrated out."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numba import njit
@@ -21,6 +18,14 @@ LOG_2PI = math.log(2.0 * math.pi)
 HUGE = 1e300
 _ELSEWHERE = 8.0  # log odds of two priors that one solution under both cannot reach
 _EDGE_PX, _SHINES = 3.0, 0.1  # a light this near the edge, or seen this flat (cosine), may be missing at no cost
+
+
+def constant(value: int) -> int:
+    """A number in numpy's type: numba compiles a function, and all below it, anew for every literal int it is given."""
+    return cast(int, np.int64(value))
+
+
+STEPS = constant(6)  # of Gauss-Newton, at most
 
 
 class Lights(NamedTuple):
@@ -41,11 +46,12 @@ class Lights(NamedTuple):
 class Seen(NamedTuple):
     """The detections of one frame.
 
-    `uv` (N, 2) px, `ray` (N, 3), `var` (N,) px^2 and the largest of them, log likelihood ratio of each for each layer
-    `like` (N, L), and `log_clutter` (N + 1,), the log price of naming so many.
+    `uv` (N, 2) px and their order `by_u` (N,) by column, `ray` (N, 3), `var` (N,) px^2 and the largest of them, log
+    likelihood ratio of each for each layer `like` (N, L), and `log_clutter` (N + 1,), the log price of naming so many.
     """
 
     uv: Array
+    by_u: Indices
     ray: Array
     var: Array
     loosest: float
@@ -66,6 +72,43 @@ class Expected(NamedTuple):
     q: Array
 
 
+class Scene(NamedTuple):
+    """One frame: the lights that may be in view, the detections, and what is expected of the attitude."""
+
+    lights: Lights
+    seen: Seen
+    expected: Expected
+
+
+class Naming(NamedTuple):
+    """A hypothesis: `name` (M,), the detection that each light is given, or -1; and its pose `R`, `t` of T_cam_dock."""
+
+    name: Indices
+    R: Array
+    t: Array
+
+
+@njit(cache=True, error_model="numpy")
+def copied(one: Naming) -> Naming:
+    """The same hypothesis in arrays of its own."""
+    return Naming(one.name.copy(), one.R.copy(), one.t.copy())
+
+
+@njit(cache=True, error_model="numpy")
+def put(target: Naming, source: Naming) -> None:
+    """Overwrite a hypothesis, in place."""
+    target.name[:], target.R[:], target.t[:] = source.name, source.R, source.t
+
+
+@njit(cache=True, error_model="numpy")
+def keep(e: float, best: float, one: Naming, better: Naming) -> float:
+    """Remember in `better`, in place, a hypothesis of log evidence `e` that beats the best; the better of the two."""
+    if not e > best:
+        return best
+    put(better, one)
+    return e
+
+
 @njit(cache=True, error_model="numpy")
 def survey_var(lens: Array, R: Array, t: Array, p: Array, survey_m2: float) -> float:
     """Variance px^2 that the survey error of a light at `p` (3,) adds."""
@@ -74,47 +117,28 @@ def survey_var(lens: Array, R: Array, t: Array, p: Array, survey_m2: float) -> f
 
 
 @njit(cache=True, error_model="numpy")
-def fit(
-    name: Indices,
-    lights: Lights,
-    seen: Seen,
-    R: Array,
-    t: Array,
-    Rp: Array,
-    info: Array,
-    steps: int,
-    H: Array,
-    L: Array,
-) -> tuple[float, float, float]:
+def fit(one: Naming, scene: Scene, info: Array, steps: int, H: Array, L: Array) -> tuple[float, float, float]:
     """Most probable pose of the named lights, in place: cost, log det H, and the sum of log(2 pi variance)."""
-    m = len(name)
-    ps, uvs, vs = np.empty((m, 3)), np.empty((m, 2)), np.empty(m)
-    n, log_var = 0, 0.0
-    for c in range(m):
-        i = name[c]
-        if i < 0:
-            continue
-        ps[n] = lights.p[c]
-        uvs[n] = seen.uv[i]
-        vs[n] = seen.var[i] + survey_var(lights.lens, R, t, lights.p[c], lights.survey_m2[c])
-        log_var += LOG_2PI + math.log(vs[n])
-        n += 1
-    cost, log_det = refine(lights.lens, ps, uvs, vs, n, R, t, Rp, info, steps, H, L)
+    lights, seen, expected = scene
+    name, R, t = one
+    used, log_var = named_lights(name), 0.0
+    ps, uvs, vs = np.empty((len(used), 3)), np.empty((len(used), 2)), np.empty(len(used))
+    for k in range(len(used)):
+        c = used[k]
+        ps[k] = lights.p[c]
+        uvs[k] = seen.uv[name[c]]
+        vs[k] = seen.var[name[c]] + survey_var(lights.lens, R, t, lights.p[c], lights.survey_m2[c])
+        log_var += LOG_2PI + math.log(vs[k])
+    cost, log_det = refine(lights.lens, ps, uvs, vs, R, t, expected.Rp, info, steps, H, L)
     return cost, log_det, log_var
 
 
 @njit(cache=True, error_model="numpy")
-def log_evidence(
-    name: Indices,
-    lights: Lights,
-    seen: Seen,
-    R: Array,
-    t: Array,
-    info: Array,
-    q: Array,
-    fitted: tuple[float, float, float],
-) -> float:
+def log_evidence(one: Naming, scene: Scene, info: Array, fitted: tuple[float, float, float]) -> float:
     """Log evidence of a hypothesis over "all clutter", the pose integrated out by Laplace's method."""
+    lights, seen, expected = scene
+    name, R, t = one
+    q = expected.q
     cost, log_det, log_var = fitted
     if math.isnan(cost) or math.isnan(log_det):
         return -HUGE
@@ -155,33 +179,28 @@ def _shines(lights: Lights, R: Array, t: Array, c: int) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
-def evidence(
-    name: Indices,
-    lights: Lights,
-    seen: Seen,
-    expected: Expected,
-    R: Array,
-    t: Array,
-    steps: int,
-    H: Array,
-    L: Array,
-) -> float:
+def evidence(one: Naming, scene: Scene, steps: int, H: Array, L: Array) -> float:
     """Log evidence of a naming whose pose is solved anew, in place, under the whole attitude prior.
 
     The prior is a mixture: a share `STEADY` of vehicles holds its attitude as `expected.steady` says. The pose and the
     normal matrix `H` are those under the wide part, unless it leads to another solution that is out of the question.
     """
-    q = expected.q
-    fitted = fit(name, lights, seen, R, t, expected.Rp, expected.info, steps, H, L)
-    wide = log_evidence(name, lights, seen, R, t, expected.info, q, fitted)
-    if q[STEADY] <= 0.0 or wide <= -HUGE:
+    wide = solved(one, scene, scene.expected.info, steps, H, L)
+    steady = scene.expected.q[STEADY]
+    if steady <= 0.0 or wide <= -HUGE:
         return wide
-    Rn, tn, Hn = R.copy(), t.copy(), np.empty((6, 6))
-    fitted = fit(name, lights, seen, Rn, tn, expected.Rp, expected.steady, steps, Hn, L)
-    narrow = log_evidence(name, lights, seen, Rn, tn, expected.steady, q, fitted)
+    held, H_held = copied(one), np.empty((6, 6))
+    narrow = solved(held, scene, scene.expected.steady, steps, H_held, L)
     if narrow > wide + _ELSEWHERE:
-        R[:], t[:], H[:] = Rn, tn, Hn
-    return log_add(wide + math.log(1.0 - q[STEADY]), narrow + math.log(q[STEADY]))
+        put(one, held)
+        H[:] = H_held
+    return log_add(wide + math.log(1.0 - steady), narrow + math.log(steady))
+
+
+@njit(cache=True, error_model="numpy")
+def solved(one: Naming, scene: Scene, info: Array, steps: int, H: Array, L: Array) -> float:
+    """Log evidence of a naming whose pose is solved anew, in place, under an attitude prior of `info` (3,)."""
+    return log_evidence(one, scene, info, fit(one, scene, info, steps, H, L))
 
 
 @njit(cache=True, error_model="numpy")
@@ -212,6 +231,27 @@ def named(name: Indices) -> int:
     for c in range(len(name)):
         n += name[c] >= 0
     return n
+
+
+@njit(cache=True, error_model="numpy")
+def named_lights(name: Indices) -> Indices:
+    """The lights (K,) that a naming names."""
+    lights, n = np.empty(named(name), np.int64), 0
+    for c in range(len(name)):
+        if name[c] >= 0:
+            lights[n] = c
+            n += 1
+    return lights
+
+
+@njit(cache=True, error_model="numpy")
+def named_points(name: Indices, p: Array) -> Array:
+    """Positions (K, 3) of the lights that a naming names."""
+    lights = named_lights(name)
+    points = np.empty((len(lights), 3))
+    for k in range(len(lights)):
+        points[k] = p[lights[k]]
+    return points
 
 
 @njit(cache=True, error_model="numpy")

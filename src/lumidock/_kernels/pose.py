@@ -14,7 +14,7 @@ from numba import njit
 from lumidock._kernels.lens import factor, project, rotate_exp, solve_factored
 from lumidock.datatypes import Array
 
-_LOG_2PI = math.log(2.0 * math.pi)
+SAME_TURN = 2e-3  # rad; closer solutions are one
 _MAX_TURN, _FAR_LOG = 0.5, 1e9  # rad of one step; cost of what cannot be
 
 
@@ -83,14 +83,14 @@ def light_row(lens: Array, R: Array, t: Array, p: Array, h: Array) -> bool:
 
 @njit(cache=True, error_model="numpy")
 def normal_equations(
-    lens: Array, p: Array, uv: Array, var: Array, n: int, R: Array, t: Array, Rp: Array, info: Array, H: Array, g: Array
+    lens: Array, p: Array, uv: Array, var: Array, R: Array, t: Array, Rp: Array, info: Array, H: Array, g: Array
 ) -> float:
     """Fill the lower triangle of `H` (6, 6) and `g` (6,) at the pose; the cost, or NaN when a light is out of sight."""
     h = np.empty(14)
     H[:] = 0.0
     g[:] = 0.0
     cost = _add_prior(R, Rp, info, H, g)
-    for m in range(n):
+    for m in range(len(p)):
         if not light_row(lens, R, t, p[m], h):
             return np.nan
         w = 1.0 / var[m]
@@ -109,7 +109,6 @@ def refine(
     p: Array,
     uv: Array,
     var: Array,
-    n: int,
     R: Array,
     t: Array,
     Rp: Array,
@@ -124,7 +123,7 @@ def refine(
     (sum of squares over variance, prior included) and log det H, both NaN on failure.
     """
     g, R0, t0 = np.empty(6), np.empty((3, 3)), np.empty(3)
-    cost = normal_equations(lens, p, uv, var, n, R, t, Rp, info, H, g)
+    cost = normal_equations(lens, p, uv, var, R, t, Rp, info, H, g)
     damping = 0.0
     for _ in range(steps):
         if math.isnan(cost):
@@ -142,11 +141,11 @@ def refine(
             gain += step[i] * g[i]
         R0[:], t0[:] = R, t
         _move(R, t, step)
-        new_cost = normal_equations(lens, p, uv, var, n, R, t, Rp, info, H, g)
+        new_cost = normal_equations(lens, p, uv, var, R, t, Rp, info, H, g)
         if not new_cost <= cost + 1e-9:
             R[:], t[:] = R0, t0
             damping = max(10.0 * damping, 0.01)
-            cost = normal_equations(lens, p, uv, var, n, R, t, Rp, info, H, g)
+            cost = normal_equations(lens, p, uv, var, R, t, Rp, info, H, g)
             continue
         cost, damping = new_cost, 0.1 * damping if damping > 1e-4 else 0.0
         if gain < 1e-3:
@@ -168,13 +167,23 @@ def _move(R: Array, t: Array, step: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def flip(p: Array, n: int, R: Array, t: Array) -> float:
+def turn(Ra: Array, Rb: Array) -> float:
+    """Angle rad between two rotations, small or not."""
+    s = 0.0
+    for i in range(3):
+        for j in range(3):
+            s += (Ra[i, j] - Rb[i, j]) ** 2
+    return math.sqrt(0.5 * s)
+
+
+@njit(cache=True, error_model="numpy")
+def flip(p: Array, R: Array, t: Array) -> float:
     """Turn the pose into the other one that a plane seen from afar fits nearly as well; thickness of the set in m.
 
     Half a turn about the normal of the plane through `p` (n, 3), and half a turn about the line of sight to its
     centre. Source: D. Oberkampf, D. DeMenthon, L. Davis, 1996.
     """
-    c, A = np.zeros(3), np.zeros((3, 3))
+    n, c, A = len(p), np.zeros(3), np.zeros((3, 3))
     for m in range(n):
         for i in range(3):
             c[i] += p[m, i] / n

@@ -11,68 +11,59 @@ from lumidock._kernels.evidence import (
     GATE,
     HUGE,
     STEADY,
-    Expected,
-    Lights,
-    Seen,
+    STEPS,
+    Naming,
+    Scene,
+    constant,
+    copied,
     evidence,
-    fit,
     innovation,
+    keep,
     log_add,
-    log_evidence,
     named,
+    named_points,
+    put,
+    solved,
     survey_var,
 )
+from lumidock._kernels.gates import ANY, nis
+from lumidock._kernels.grow import NONE, grow
 from lumidock._kernels.lens import invert6
-from lumidock._kernels.pose import flip, light_row
-from lumidock._kernels.search import SAME_TURN, Best, grow, turn
+from lumidock._kernels.pose import SAME_TURN, flip, light_row, turn
 from lumidock.datatypes import Array, Indices
+
+_STEPS_OTHER, _STEPS_EXCHANGED = constant(20), constant(8)
+_FAR_GATES = 4.0  # gates within which another name is tried
 
 
 @njit(cache=True, error_model="numpy")
-def other_pose(
-    name: Indices,
-    lights: Lights,
-    seen: Seen,
-    expected: Expected,
-    level: bool,
-    R: Array,
-    t: Array,
-    R2: Array,
-    t2: Array,
-) -> float:
-    """Another pose `R2`, `t2` that fits the same names, and its log evidence; hugely negative where there is but one.
+def other_pose(one: Naming, scene: Scene, level: bool, other: Naming) -> float:
+    """Fill `other`, another pose that fits the same names; its log evidence, hugely negative where there is but one.
 
     Found from the flipped pose, or, with `level`, from the expected attitude: lights off the axis leave two solutions
     whose tilts are not opposite. Where the steady part of the prior leads back to the first pose, it counts there.
     """
-    H, L = np.empty((6, 6)), np.empty((6, 6))
-    ps, n = np.empty((len(name), 3)), 0
-    for c in range(len(name)):
-        if name[c] >= 0:
-            ps[n] = lights.p[c]
-            n += 1
-    R2[:], t2[:] = R, t
+    expected, H, L = scene.expected, np.empty((6, 6)), np.empty((6, 6))
+    p, steady = named_points(one.name, scene.lights.p), expected.q[STEADY]
+    put(other, one)
     if level:
-        _levelled(ps, n, expected.Rp, R2, t2)
+        _levelled(p, expected.Rp, other.R, other.t)
     else:
-        flip(ps, n, R2, t2)
-    q = expected.q
-    fitted = fit(name, lights, seen, R2, t2, expected.Rp, expected.info, 20, H, L)
-    wide = log_evidence(name, lights, seen, R2, t2, expected.info, q, fitted)
-    if wide <= -HUGE or turn(R, R2) < SAME_TURN:
+        flip(p, other.R, other.t)
+    wide = solved(other, scene, expected.info, _STEPS_OTHER, H, L)
+    if wide <= -HUGE or turn(one.R, other.R) < SAME_TURN:
         return -HUGE
-    if q[STEADY] <= 0.0:
+    if steady <= 0.0:
         return wide
-    Rn, tn = R2.copy(), t2.copy()
-    fitted = fit(name, lights, seen, Rn, tn, expected.Rp, expected.steady, 20, H, L)
-    narrow = log_evidence(name, lights, seen, Rn, tn, expected.steady, q, fitted) + math.log(q[STEADY])
-    wide += math.log(1.0 - q[STEADY])
-    return log_add(wide, narrow) if turn(R, Rn) > turn(R2, Rn) else wide
+    held = copied(other)
+    narrow = solved(held, scene, expected.steady, _STEPS_OTHER, H, L) + math.log(steady)
+    wide += math.log(1.0 - steady)
+    return log_add(wide, narrow) if turn(one.R, held.R) > turn(other.R, held.R) else wide
 
 
 @njit(cache=True, error_model="numpy")
-def _levelled(p: Array, n: int, Rp: Array, R: Array, t: Array) -> None:
-    """Turn a pose, in place, to the expected attitude with its own roll, about the centre of lights `p` (n, 3)."""
+def _levelled(p: Array, Rp: Array, R: Array, t: Array) -> None:
+    """Turn a pose, in place, to the expected attitude with its own roll, about the centre of lights `p` (N, 3)."""
     sine, cosine = 0.0, 0.0
     for k in range(3):
         sine += R[1, k] * Rp[k, 0] - R[0, k] * Rp[k, 1]
@@ -80,8 +71,8 @@ def _levelled(p: Array, n: int, Rp: Array, R: Array, t: Array) -> None:
     norm = max(math.hypot(sine, cosine), 1e-12)
     s, c = sine / norm, cosine / norm
     centre, q = np.zeros(3), t.copy()
-    for m in range(n):
-        centre += p[m] / n
+    for m in range(len(p)):
+        centre += p[m] / len(p)
     for i in range(3):
         for k in range(3):
             q[i] += R[i, k] * centre[k]
@@ -96,18 +87,7 @@ def _levelled(p: Array, n: int, Rp: Array, R: Array, t: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def rivals(
-    name: Indices,
-    taken: Indices,
-    lights: Lights,
-    seen: Seen,
-    expected: Expected,
-    R: Array,
-    t: Array,
-    without: Array,
-    against: Array,
-    better: Best,
-) -> float:
+def rivals(one: Naming, taken: Indices, scene: Scene, without: Array, against: Array, better: Naming) -> float:
     """Hypotheses one relabelling away, each solved anew.
 
     A detection left out, with others added where they then fit; another detection for a light; another light for a
@@ -117,98 +97,66 @@ def rivals(
     """
     best = -HUGE
     H, L, P = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    R0, t0, trial = np.empty((3, 3)), np.empty(3), name.copy()
     without[:] = -HUGE
     against[:] = -HUGE
-    for c in range(len(name)):
-        if name[c] < 0:
+    for c in range(len(one.name)):
+        if one.name[c] < 0:
             continue
-        trial[c] = -1
-        R0[:], t0[:] = R, t
-        e = evidence(trial, lights, seen, expected, R0, t0, 6, H, L)
-        without[c] = e
-        best = _keep(e, best, trial, R0, t0, better)
-        best = _regrown(c, trial, taken, lights, seen, expected, R0, t0, against, best, better)
-        if e > -HUGE and not math.isnan(invert6(H, L, P)):
-            best = _exchanged(c, name, trial, taken, lights, seen, expected, R0, t0, P, against, best, better)
-        trial[c] = name[c]
+        less = copied(one)
+        less.name[c] = -1
+        without[c] = evidence(less, scene, STEPS, H, L)
+        best = keep(without[c], best, less, better)
+        best = _regrown(c, less, taken, scene, against, best, better)
+        if without[c] > -HUGE and not math.isnan(invert6(H, L, P)):
+            best = _exchanged(c, one.name, less, taken, scene, P, against, best, better)
     return best
 
 
 @njit(cache=True, error_model="numpy")
-def _keep(e: float, best: float, name: Indices, R: Array, t: Array, better: Best) -> float:
-    """Remember a hypothesis that beats the best."""
-    if e > best:
-        better.name[:], better.R[:], better.t[:] = name, R, t
-    return max(e, best)
-
-
-@njit(cache=True, error_model="numpy")
-def _regrown(
-    c: int,
-    trial: Indices,
-    taken: Indices,
-    lights: Lights,
-    seen: Seen,
-    expected: Expected,
-    R0: Array,
-    t0: Array,
-    against: Array,
-    best: float,
-    better: Best,
-) -> float:
+def _regrown(c: int, less: Naming, taken: Indices, scene: Scene, against: Array, best: float, better: Naming) -> float:
     """Without the name of light `c` others may find their place."""
-    H, L = np.empty((6, 6)), np.empty((6, 6))
-    grown, held, R, t = trial.copy(), taken.copy(), R0.copy(), t0.copy()
-    grow(-1, grown, held, lights, seen, expected, R, t, np.empty((3, 6, 6)), 0)
-    if named(grown) <= named(trial):
+    grown, H, L = copied(less), np.empty((6, 6)), np.empty((6, 6))
+    grow(ANY, grown, taken.copy(), scene, NONE)
+    if named(grown.name) <= named(less.name):
         return best
-    e = evidence(grown, lights, seen, expected, R, t, 6, H, L)
+    e = evidence(grown, scene, STEPS, H, L)
     against[c] = log_add(against[c], e)
-    return _keep(e, best, grown, R, t, better)
+    return keep(e, best, grown, better)
 
 
 @njit(cache=True, error_model="numpy")
 def _exchanged(
     c: int,
     name: Indices,
-    trial: Indices,
+    less: Naming,
     taken: Indices,
-    lights: Lights,
-    seen: Seen,
-    expected: Expected,
-    R0: Array,
-    t0: Array,
+    scene: Scene,
     P: Array,
     against: Array,
     best: float,
-    better: Best,
+    better: Naming,
 ) -> float:
-    """Another detection for light `c`; its detection for an unnamed light; or exchanged with that of a later light."""
+    """Another detection for light `c`; its detection for an unnamed light; or exchanged with that of a later light.
+
+    `name` (M,) are all names; `less` is without that of `c`, its pose of covariance `P`.
+    """
+    lights, seen, gate = scene.lights, scene.seen, _FAR_GATES * scene.expected.q[GATE]
     i, h, S = name[c], np.empty(14), np.empty(3)
     H, L = np.empty((6, 6)), np.empty((6, 6))
-    R, t = np.empty((3, 3)), np.empty(3)
     for c2 in range(len(name)):
-        if (c2 < c and name[c2] >= 0) or not light_row(lights.lens, R0, t0, lights.p[c2], h):
+        if (c2 < c and name[c2] >= 0) or not light_row(lights.lens, less.R, less.t, lights.p[c2], h):
             continue
-        innovation(h, P, survey_var(lights.lens, R0, t0, lights.p[c2], lights.survey_m2[c2]), S)
+        innovation(h, P, survey_var(lights.lens, less.R, less.t, lights.p[c2], lights.survey_m2[c2]), S)
         for k in range(len(seen.uv)):
             if (c2 == c and (k == i or taken[k] >= 0)) or (c2 != c and k != i):
                 continue
-            du, dv = seen.uv[k, 0] - h[0], seen.uv[k, 1] - h[1]
-            s0, s1, s2 = S[0] + seen.var[k], S[1], S[2] + seen.var[k]
-            nis = (s2 * du * du - 2.0 * s1 * du * dv + s0 * dv * dv) / (s0 * s2 - s1 * s1)
-            if nis > 4.0 * expected.q[GATE]:
+            if nis(seen.uv[k, 0] - h[0], seen.uv[k, 1] - h[1], S, seen.var[k])[0] > gate:
                 continue
-            j = name[c2]
-            trial[c], trial[c2] = j if c2 != c else -1, k
-            R[:], t[:] = R0, t0
-            e = evidence(trial, lights, seen, expected, R, t, 8, H, L)
+            one, j = copied(less), name[c2]
+            one.name[c], one.name[c2] = j if c2 != c else -1, k
+            e = evidence(one, scene, _STEPS_EXCHANGED, H, L)
             against[c] = log_add(against[c], e)
             if c2 != c and j >= 0:
                 against[c2] = log_add(against[c2], e)
-            best = _keep(e, best, trial, R, t, better)
-            trial[c] = -1
-            if c2 != c:
-                trial[c2] = j
+            best = keep(e, best, one, better)
     return best
