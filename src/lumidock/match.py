@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lumidock._kernels import evidence as kernel
-from lumidock._kernels.evidence import Expected, Lights, Naming, Scene, Seen
+from lumidock._kernels.evidence import Naming, Scene
 from lumidock._kernels.rivals import other_pose, rivals
 from lumidock._kernels.search import Goal, Listed, search
 from lumidock.camera import Camera
@@ -36,16 +36,16 @@ _FLAT = 0.05  # a layer less thick than this share of its width is a plane
 class Plan:
     """A station as the search wants it: M lights, the order in which pairs are tried, and what is unseen before each.
 
-    `unseen` (S,) is the most lights of one layer in a naming without the pairs before; `mirrored` are the lights as the
-    water's surface shows them.
+    `unseen` (S,) is the most lights of one layer in a naming without the pairs before; `survey_m2` (M,) the
+    variance of a position, `rank` (M,) the place of a light in its layer's order.
     """
 
     lens: Array
     p_dock: Array
     layer: Indices
     axis: Array
-    direct: Lights
-    mirrored: Lights
+    survey_m2: Array
+    rank: Indices
     pairs: Indices
     unseen: Indices
     n_layers: int
@@ -101,14 +101,13 @@ def plan(station: Station, camera: Camera, config: MatchConfig) -> Plan:
     size = np.array([camera.width, camera.height]) / camera.focal_px
     volume = float(size.prod()) * config.far_m**3 / 3.0
     is_rear = (behind == len(front_first) - 1).astype(np.int64)
-    direct = Lights(camera.lens(), np.ascontiguousarray(station.p_dock), station.layer, station.axis, survey_m2, rank)
     return Plan(
-        direct.lens,
-        direct.p,
+        camera.lens(),
+        np.ascontiguousarray(station.p_dock),
         station.layer,
         station.axis,
-        direct,
-        direct._replace(p=direct.p * _MIRROR, axis=direct.axis * _MIRROR),
+        survey_m2,
+        rank,
         pairs,
         unseen,
         len(station.layers),
@@ -236,14 +235,13 @@ def _parameters(plan: Plan, config: MatchConfig, tilt_var: float, roll_sigma: fl
 class _Question:
     """One frame's spots and what is expected of them, as the kernels want them."""
 
-    seen: Seen
-    expected: Expected
+    scene: Scene
     plan: Plan
     config: MatchConfig
 
-    def scene(self, lights: Lights) -> Scene:
-        """The frame with these lights, or their mirror images, in it."""
-        return Scene(lights, self.seen, self.expected)
+    def mirrored(self) -> Scene:
+        """The frame with the lights as the water's surface shows them."""
+        return self.scene._replace(p=self.scene.p * _MIRROR, axis=self.scene.axis * _MIRROR)
 
 
 def _question(plan: Plan, found: Spots, camera: Camera, expected: Prior, config: MatchConfig) -> _Question:
@@ -251,12 +249,30 @@ def _question(plan: Plan, found: Spots, camera: Camera, expected: Prior, config:
     var = found.var + (offset**2).sum(axis=1)
     tilt_var, roll_sigma = float(1.0 / expected.info[:2].min()), float(expected.info[2] ** -0.5)
     q = _parameters(plan, config, tilt_var, roll_sigma, mixed=not expected.measured)
-    by_u, loosest = np.argsort(found.uv[:, 0]), float(var.max(initial=0.0))
-    seen = Seen(found.uv, by_u, camera.unproject(found.uv), var, loosest, found.like, _log_clutter(found))
+    by_u: Indices = np.argsort(found.uv[:, 0])
     steady = expected.info * config.steadier**2
     if roll_sigma > _OPEN_ROLL:
         steady[2] = expected.info[2]
-    return _Question(seen, Expected(expected.R_dock_cam, expected.info, steady, q), plan, config)
+    scene = Scene(
+        plan.lens,
+        plan.p_dock,
+        plan.layer,
+        plan.axis,
+        plan.survey_m2,
+        plan.rank,
+        found.uv,
+        by_u,
+        camera.unproject(found.uv),
+        var,
+        float(var.max(initial=0.0)),
+        found.like,
+        _log_clutter(found),
+        expected.R_dock_cam,
+        expected.info,
+        steady,
+        q,
+    )
+    return _Question(scene, plan, config)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -273,21 +289,21 @@ class _Found:
     whole: bool
 
 
-def _search(ask: _Question, lights: Lights, floor: int, *leasts: int, best: float = _NONE) -> _Found:
+def _search(ask: _Question, scene: Scene, floor: int, *leasts: int, best: float = _NONE) -> _Found:
     """Hypotheses that name at least `floor` lights, by searches that want ever fewer of one layer.
 
     A later search runs only where the one before left doubt and the spots are few. `best` is a log evidence to measure
     up to.
     """
     plan, k, count = ask.plan, ask.config.hypotheses, 0
-    listed = Listed(np.empty((k, len(lights.p)), np.int64), np.empty(k), np.empty((k, 3, 3)), np.empty((k, 3)))
+    listed = Listed(np.empty((k, len(scene.p)), np.int64), np.empty(k), np.empty((k, 3, 3)), np.empty((k, 3)))
     budget = np.array([ask.config.max_pairs])
     for least in leasts:
         bounds = np.array([least, floor, floor, floor - 1 if floor > least else 0])
         goal = Goal(bounds, budget, np.array([max(best, listed.scores[:count].max(initial=_NONE))]))
-        count = search(ask.scene(lights), plan.pairs, plan.unseen, goal, count, listed)
+        count = search(scene, plan.pairs, plan.unseen, goal, count, listed)
         sure = count > 0 and listed.scores[:count].max() > ask.config.sure
-        if sure or len(ask.seen.uv) > ask.config.max_spots_three:
+        if sure or len(ask.scene.uv) > ask.config.max_spots_three:
             break
     order = np.argsort(-listed.scores[:count], kind="stable")
     names, scores, Rs, ts = listed
@@ -308,11 +324,11 @@ class _Polished:
 
 def _polish(ask: _Question, name: Indices, R: Array, t: Array, score: float) -> _Polished:
     """Follow the best relabelling as long as it is better."""
-    m, scene = len(name), ask.scene(ask.plan.direct)
+    m = len(name)
     for _ in range(_MAX_RELABELLINGS):
         without, against = np.empty(m), np.empty(m)
-        better, taken = _no_naming(m), light_of(name, len(ask.seen.uv))
-        best = rivals(Naming(name, R, t), taken, scene, without, against, better)
+        better, taken = _no_naming(m), light_of(name, len(ask.scene.uv))
+        best = rivals(Naming(name, R, t), taken, ask.scene, without, against, better)
         if best <= score:
             break
         name, R, t, score = *better, best
@@ -334,7 +350,7 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
         part = replace(found, **{key: getattr(found, key)[likely] for key in ("uv", "cov", "var", "like", "p_light")})
         return _renamed(acquire(part, plan, camera, expected, config), likely)
     ask = _question(plan, found, camera, expected, config)
-    listed = _search(ask, plan.direct, 3, 4, 3)
+    listed = _search(ask, ask.scene, 3, 4, 3)
     if not listed.whole:
         return Acquisition((), (), 0.0, "too_many")
     if not len(listed.scores):
@@ -367,7 +383,7 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
 def _other_pose(ask: _Question, top: _Polished, *, level: bool) -> tuple[Array, float] | None:
     """Another pose of the best names, if there is one nearly as good, and its log evidence."""
     other = _no_naming(len(top.name))
-    score = other_pose(Naming(top.name, top.R, top.t), ask.scene(ask.plan.direct), level, other)
+    score = other_pose(Naming(top.name, top.R, top.t), ask.scene, level, other)
     return (_pose(other.R, other.t), float(score)) if score > top.score - ask.config.keep else None
 
 
@@ -427,7 +443,7 @@ def _crowding(strays: int, area: float, plan: Plan, config: MatchConfig) -> floa
 def _mirror_evidence(ask: _Question, top: _Polished) -> float:
     """Log evidence, prior included, that the water's surface shows the array: only where it stands above the camera."""
     named = int((top.name >= 0).sum())
-    listed = _search(ask, ask.plan.mirrored, named, min(named, 4), best=top.score)
+    listed = _search(ask, ask.mirrored(), named, min(named, 4), best=top.score)
     if not listed.whole:
         return top.score
     camera_y = -np.einsum("ki,ki->k", listed.Rs[:, :, 1], listed.ts)

@@ -28,17 +28,6 @@ class Terms(NamedTuple):
     max_nodes: int
 
 
-class _Joint(NamedTuple):
-    """The lights `chosen` so far, the Cholesky factor `L` (2 M, 2 M) of their joint covariance and their innovation.
-
-    `w` (2 M,) is whitened by the factor.
-    """
-
-    chosen: Indices
-    L: Array
-    w: Array
-
-
 @njit(cache=True, error_model="numpy")
 def associate(
     foreseen: Foreseen,
@@ -58,7 +47,8 @@ def associate(
     those after it through their joint covariance (J. Neira, J. Tardos, 2001). Costs are -log evidence over "all
     clutter"; namings more than `reach` behind the best are not followed.
     """
-    shown, m = foreseen.shown, len(foreseen.expected)
+    expected, S, shown = foreseen
+    m = len(shown)
     log_clutter, detect, gate, reach, max_nodes = terms
     cand, n_cand = _candidates(foreseen, uv, var, gate)
     order, always, miss = _fewest_first(n_cand, len(uv)), 0.0, -math.log(1.0 - detect)
@@ -66,7 +56,7 @@ def associate(
         if n_cand[c] == 0 and shown[c] == 2.0:
             always += miss
     least, depth = _least(foreseen, order, cand, n_cand, layer, var, like, terms), len(order)
-    joint = _Joint(np.empty(m, np.int64), np.empty((2 * m, 2 * m)), np.empty(2 * m))
+    chosen, L, w = np.empty(m, np.int64), np.empty((2 * m, 2 * m)), np.empty(2 * m)
     count, cost, at = np.zeros(m + 1, np.int64), np.zeros(m + 1), np.zeros(m + 1, np.int64)
     name, taken = np.full(m, -1, np.int64), np.full(len(uv), -1, np.int64)
     found, d, nodes, best = 0, 0, 0, np.inf
@@ -96,10 +86,11 @@ def associate(
             i = cand[c, k]
             if taken[i] >= 0:
                 continue
-            price = _name_one(foreseen, joint, count[d], c, uv[i], var[i], gate)
+            price = _name_one(expected, S, L, w, chosen, count[d], c, uv[i], var[i], gate)
             if math.isnan(price):
                 continue
             cost[d + 1] = cost[d] + price + log_clutter - math.log(detect) - like[i, layer[c]]
+            chosen[count[d]] = c
             count[d + 1] = count[d] + 1
             name[c], taken[i] = i, c
         if cost[d + 1] + least[d + 1] > best + reach:
@@ -207,13 +198,23 @@ def _narrowest(S: Array, order: Indices, var: float, narrow: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _name_one(foreseen: Foreseen, joint: _Joint, count: int, c: int, uv: Array, var: float, gate: float) -> float:
-    """Cost of naming light `c` after a detection, given the `count` named before; NaN outside the gate.
+def _name_one(
+    expected: Array,
+    S: Array,
+    L: Array,
+    w: Array,
+    chosen: Indices,
+    count: int,
+    c: int,
+    uv: Array,
+    var: float,
+    gate: float,
+) -> float:
+    """Cost of naming light `c` after a detection, given the `count` `chosen` before; NaN outside the gate.
 
-    Where it is not, adds the light to `joint`.
+    Adds two rows to the Cholesky factor `L` of the joint covariance and to the whitened innovation `w`.
     """
-    expected, S, n = foreseen.expected, foreseen.S, 2 * count
-    chosen, L, w = joint
+    n = 2 * count
     a, b, d = S[2 * c, 2 * c] + var, S[2 * c, 2 * c + 1], S[2 * c + 1, 2 * c + 1] + var
     du, dv = uv[0] - expected[c, 0], uv[1] - expected[c, 1]
     for r in range(n):
@@ -235,7 +236,6 @@ def _name_one(foreseen: Foreseen, joint: _Joint, count: int, c: int, uv: Array, 
     nis = (d * du * du - 2.0 * b * du * dv + a * dv * dv) / det
     if not nis < gate:
         return np.nan
-    chosen[count] = c
     L[n, n] = math.sqrt(a)
     L[n + 1, n] = b / L[n, n]
     L[n + 1, n + 1] = math.sqrt(det / a)

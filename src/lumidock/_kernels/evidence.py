@@ -28,11 +28,15 @@ def constant(value: int) -> int:
 STEPS = constant(6)  # of Gauss-Newton, at most
 
 
-class Lights(NamedTuple):
-    """The station as one lens sees it.
+class Scene(NamedTuple):
+    """One frame: the lights of the station as a lens sees it, the detections, and what is expected of the attitude.
 
-    Lens (16,), positions `p` (M, 3) m, `layer` (M,), `axis` (M, 3), `survey_m2` (M,) variance of a position, and the
-    `rank` (M,) of each light in its layer.
+    Flat, because numba counts the references to every array of a tuple that it takes out of another. M lights: lens
+    (16,), positions `p` (M, 3) m, `layer` (M,), `axis` (M, 3), `survey_m2` (M,) variance of a position, and the `rank`
+    (M,) of each in its layer. N detections: `uv` (N, 2) px and their order `by_u` (N,) by column, `ray` (N, 3), `var`
+    (N,) px^2 and the largest of them, log likelihood ratio of each for each layer `like` (N, L), and `log_clutter`
+    (N + 1,), the log price of naming so many. The attitude: `Rp` (3, 3) = R_dock_cam, `info` (3,) 1/rad^2 of tilt, tilt
+    and roll, `steady` (3,) the same of a vehicle that holds its attitude well, and the parameters `q`.
     """
 
     lens: Array
@@ -41,15 +45,6 @@ class Lights(NamedTuple):
     axis: Array
     survey_m2: Array
     rank: Indices
-
-
-class Seen(NamedTuple):
-    """The detections of one frame.
-
-    `uv` (N, 2) px and their order `by_u` (N,) by column, `ray` (N, 3), `var` (N,) px^2 and the largest of them, log
-    likelihood ratio of each for each layer `like` (N, L), and `log_clutter` (N + 1,), the log price of naming so many.
-    """
-
     uv: Array
     by_u: Indices
     ray: Array
@@ -57,27 +52,10 @@ class Seen(NamedTuple):
     loosest: float
     like: Array
     log_clutter: Array
-
-
-class Expected(NamedTuple):
-    """The attitude prior and the parameters `q`.
-
-    `Rp` (3, 3) = R_dock_cam, `info` (3,) 1/rad^2 of tilt, tilt and roll, and `steady` (3,) the same of a vehicle that
-    holds its attitude well.
-    """
-
     Rp: Array
     info: Array
     steady: Array
     q: Array
-
-
-class Scene(NamedTuple):
-    """One frame: the lights that may be in view, the detections, and what is expected of the attitude."""
-
-    lights: Lights
-    seen: Seen
-    expected: Expected
 
 
 class Naming(NamedTuple):
@@ -119,46 +97,44 @@ def survey_var(lens: Array, R: Array, t: Array, p: Array, survey_m2: float) -> f
 @njit(cache=True, error_model="numpy")
 def fit(one: Naming, scene: Scene, info: Array, steps: int, H: Array, L: Array) -> tuple[float, float, float]:
     """Most probable pose of the named lights, in place: cost, log det H, and the sum of log(2 pi variance)."""
-    lights, seen, expected = scene
     name, R, t = one
     used, log_var = named_lights(name), 0.0
     ps, uvs, vs = np.empty((len(used), 3)), np.empty((len(used), 2)), np.empty(len(used))
     for k in range(len(used)):
         c = used[k]
-        ps[k] = lights.p[c]
-        uvs[k] = seen.uv[name[c]]
-        vs[k] = seen.var[name[c]] + survey_var(lights.lens, R, t, lights.p[c], lights.survey_m2[c])
+        ps[k] = scene.p[c]
+        uvs[k] = scene.uv[name[c]]
+        vs[k] = scene.var[name[c]] + survey_var(scene.lens, R, t, scene.p[c], scene.survey_m2[c])
         log_var += LOG_2PI + math.log(vs[k])
-    cost, log_det = refine(lights.lens, ps, uvs, vs, R, t, expected.Rp, info, steps, H, L)
+    cost, log_det = refine(scene.lens, ps, uvs, vs, R, t, scene.Rp, info, steps, H, L)
     return cost, log_det, log_var
 
 
 @njit(cache=True, error_model="numpy")
 def log_evidence(one: Naming, scene: Scene, info: Array, fitted: tuple[float, float, float]) -> float:
     """Log evidence of a hypothesis over "all clutter", the pose integrated out by Laplace's method."""
-    lights, seen, expected = scene
     name, R, t = one
-    q = expected.q
+    q = scene.q
     cost, log_det, log_var = fitted
     if math.isnan(cost) or math.isnan(log_det):
         return -HUGE
-    total = 1.5 * LOG_2PI - 0.5 * log_det - 0.5 * cost - log_var - seen.log_clutter[named(name)]
+    total = 1.5 * LOG_2PI - 0.5 * log_det - 0.5 * cost - log_var - scene.log_clutter[named(name)]
     distance = max(math.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2]), q[NEAR_M])
     # position prior: half flat inside the view cone, half flat in the logarithm of the distance
     near = (q[FAR_M] / distance) ** 3 / (3.0 * math.log(q[FAR_M] / q[NEAR_M]))
     total += math.log(0.5 + 0.5 * near) - q[LOG_VOLUME]
     for k in range(3):
         total += 0.5 * math.log(info[k])
-    layers = seen.like.shape[1]
+    layers = scene.like.shape[1]
     matched, missed = np.zeros(layers, np.int64), np.zeros(layers, np.int64)
     h = np.empty(14)
     for c in range(len(name)):
-        i, layer = name[c], lights.layer[c]
+        i, layer = name[c], scene.layer[c]
         if i >= 0:
-            total += math.log(q[DETECT]) + seen.like[i, layer]
+            total += math.log(q[DETECT]) + scene.like[i, layer]
             matched[layer] += 1
-        elif light_row(lights.lens, R, t, lights.p[c], h) and inside(lights.lens, h[0], h[1], _EDGE_PX):
-            missed[layer] += _shines(lights, R, t, c)
+        elif light_row(scene.lens, R, t, scene.p[c], h) and inside(scene.lens, h[0], h[1], _EDGE_PX):
+            missed[layer] += _shines(scene, R, t, c)
     for k in range(layers):
         miss = missed[k] * math.log(1.0 - q[DETECT])
         if matched[k] == 0 and missed[k] > 0:
@@ -168,13 +144,13 @@ def log_evidence(one: Naming, scene: Scene, info: Array, fitted: tuple[float, fl
 
 
 @njit(cache=True, error_model="numpy")
-def _shines(lights: Lights, R: Array, t: Array, c: int) -> bool:
+def _shines(scene: Scene, R: Array, t: Array, c: int) -> bool:
     """Whether light `c` sends its light toward the camera, which stands at -R^T t."""
     norm, along = 0.0, 0.0
     for k in range(3):
-        away = -(R[0, k] * t[0] + R[1, k] * t[1] + R[2, k] * t[2]) - lights.p[c, k]
+        away = -(R[0, k] * t[0] + R[1, k] * t[1] + R[2, k] * t[2]) - scene.p[c, k]
         norm += away * away
-        along += away * lights.axis[c, k]
+        along += away * scene.axis[c, k]
     return along > _SHINES * math.sqrt(norm)
 
 
@@ -182,15 +158,15 @@ def _shines(lights: Lights, R: Array, t: Array, c: int) -> bool:
 def evidence(one: Naming, scene: Scene, steps: int, H: Array, L: Array) -> float:
     """Log evidence of a naming whose pose is solved anew, in place, under the whole attitude prior.
 
-    The prior is a mixture: a share `STEADY` of vehicles holds its attitude as `expected.steady` says. The pose and the
+    The prior is a mixture: a share `STEADY` of vehicles holds its attitude as `scene.steady` says. The pose and the
     normal matrix `H` are those under the wide part, unless it leads to another solution that is out of the question.
     """
-    wide = solved(one, scene, scene.expected.info, steps, H, L)
-    steady = scene.expected.q[STEADY]
+    wide = solved(one, scene, scene.info, steps, H, L)
+    steady = scene.q[STEADY]
     if steady <= 0.0 or wide <= -HUGE:
         return wide
     held, H_held = copied(one), np.empty((6, 6))
-    narrow = solved(held, scene, scene.expected.steady, steps, H_held, L)
+    narrow = solved(held, scene, scene.steady, steps, H_held, L)
     if narrow > wide + _ELSEWHERE:
         put(one, held)
         H[:] = H_held

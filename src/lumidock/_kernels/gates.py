@@ -39,14 +39,14 @@ def new_sight(m: int) -> Sight:
 @njit(cache=True, error_model="numpy")
 def look(allowed: int, one: Naming, scene: Scene, sight: Sight) -> None:
     """Where the unnamed lights of layer `allowed` (-1: any) are expected; fills all of `sight` but `P`."""
-    lights, rows, S, extra, there = scene.lights, sight.rows, sight.S, sight.extra, sight.there
+    rows, S, extra, there = sight.rows, sight.S, sight.extra, sight.there
     name, R, t = one
     for c in range(len(name)):
-        there[c] = name[c] < 0 and (allowed < 0 or lights.layer[c] == allowed)
+        there[c] = name[c] < 0 and (allowed < 0 or scene.layer[c] == allowed)
         if there[c]:
-            there[c] = light_row(lights.lens, R, t, lights.p[c], rows[c])
+            there[c] = light_row(scene.lens, R, t, scene.p[c], rows[c])
         if there[c]:
-            extra[c] = survey_var(lights.lens, R, t, lights.p[c], lights.survey_m2[c])
+            extra[c] = survey_var(scene.lens, R, t, scene.p[c], scene.survey_m2[c])
             innovation(rows[c], sight.P, extra[c], S[c])
 
 
@@ -57,7 +57,7 @@ def cheapest(after: int, sight: Sight, taken: Indices, scene: Scene, gate: float
     Fills rows of `out` (K, 3) with NIS + log det S - 2 log likelihood, light and detection; returns how many, and how
     many lights have a detection not far outside their gate.
     """
-    rank, layer, uv, var, like = scene.lights.rank, scene.lights.layer, scene.seen.uv, scene.seen.var, scene.seen.like
+    rank, layer, uv, var, like = scene.rank, scene.layer, scene.uv, scene.var, scene.like
     found, near = 0, 0
     for c in range(len(layer)):
         if not sight.there[c] or rank[c] <= after:
@@ -103,10 +103,10 @@ def support(c: int, i: int, sight: Sight, taken: Indices, scene: Scene, var: Arr
 
     By one linear update of the pose and its covariance. `var` (N,) px^2 of the detections, `loosest` the largest.
     """
-    rows, layer, seen = sight.rows, scene.lights.layer, scene.seen
+    rows, layer, uv, by_u = sight.rows, scene.layer, scene.uv, scene.by_u
     row, S, P2, shift, found = rows[c], np.empty(3), np.empty((6, 6)), np.empty(6), 0
-    S[0], S[1], S[2] = sight.S[c, 0] + seen.var[i], sight.S[c, 1], sight.S[c, 2] + seen.var[i]
-    _condition(row, sight.P, S, seen.uv[i, 0] - row[0], seen.uv[i, 1] - row[1], P2, shift)
+    S[0], S[1], S[2] = sight.S[c, 0] + scene.var[i], sight.S[c, 1], sight.S[c, 2] + scene.var[i]
+    _condition(row, sight.P, S, uv[i, 0] - row[0], uv[i, 1] - row[1], P2, shift)
     taken[i] = c
     for other in range(len(layer)):
         if other == c or not sight.there[other] or layer[other] != layer[c]:
@@ -117,7 +117,7 @@ def support(c: int, i: int, sight: Sight, taken: Indices, scene: Scene, var: Arr
         for k in range(6):
             u += row[2 + k] * shift[k]
             v += row[8 + k] * shift[k]
-        found += occupied(u, v, S, taken, seen.uv, var, loosest, seen.by_u, gate)
+        found += occupied(u, v, S, taken, uv, var, loosest, by_u, gate)
     taken[i] = -1
     return found
 

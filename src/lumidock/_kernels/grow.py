@@ -40,7 +40,7 @@ def grow(allowed: int, one: Naming, taken: Indices, scene: Scene, least: int) ->
 
     Works in place; returns what `fit` does, NaN once `least` named lights are out of reach.
     """
-    info, gate = scene.expected.info, scene.expected.q[GATE]
+    info, gate = scene.info, scene.q[GATE]
     H, L, sight, out = np.empty((6, 6)), np.empty((6, 6)), new_sight(len(one.name)), np.empty((1, 3))
     fitted = fit(one, scene, info, STEPS, H, L)
     for _ in range(len(one.name)):
@@ -64,13 +64,13 @@ def extend(one: Naming, taken: Indices, scene: Scene) -> float:
 
     Growing greedily picks wrong where the tilt is open, so several first lights are tried. Returns the log evidence.
     """
-    best, best_one, info, gate = -HUGE, copied(one), scene.expected.info, scene.expected.q[GATE]
+    best, best_one, info, gate = -HUGE, copied(one), scene.info, scene.q[GATE]
     out, tops = np.empty((_FIRSTS, 3)), np.empty((_BRANCHES, 2))
     H, L, sight = np.empty((6, 6)), np.empty((6, 6)), new_sight(len(one.name))
     for mode in range(2):
         start = copied(one)
         if mode == 1:
-            flip(named_points(start.name, scene.lights.p), start.R, start.t)
+            flip(named_points(start.name, scene.p), start.R, start.t)
         e = solved(start, scene, info, _STEPS_FAR, H, L)
         if mode == 1 and (e < best - _HOPELESS or turn(start.R, one.R) < SAME_TURN):
             break

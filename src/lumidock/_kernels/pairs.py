@@ -14,12 +14,11 @@ from lumidock._kernels.evidence import (
     NEAR_M,
     PAIR_GATE,
     ROLL_GATE,
-    Expected,
     Scene,
     innovation,
     survey_var,
 )
-from lumidock._kernels.gates import Sight, new_sight, occupied
+from lumidock._kernels.gates import Sight, occupied
 from lumidock._kernels.lens import invert6
 from lumidock._kernels.pose import light_row
 from lumidock.datatypes import Array, Indices
@@ -37,13 +36,12 @@ class Pair(NamedTuple):
 
 
 class View(NamedTuple):
-    """The lights under a pose of which two pixels and the expected attitude are known.
+    """A pose of which two pixels and the expected attitude are known.
 
-    Their `sight`, `taken` (N,) as the light of each detection, and the pose `R`, `t`. `open` (3, 6) is the information
-    of the prior; `H` and `L` (6, 6) are work space.
+    Of each detection the light, `taken` (N,) or -1, and the pose `R`, `t`. `open` (3, 6) is the information of the
+    prior; `H` and `L` (6, 6) are work space.
     """
 
-    sight: Sight
     taken: Indices
     R: Array
     t: Array
@@ -55,14 +53,14 @@ class View(NamedTuple):
 @njit(cache=True, error_model="numpy")
 def new_view(scene: Scene) -> View:
     """Room for a view in which no detection is taken yet."""
-    taken = np.full(len(scene.seen.uv), -1, np.int64)
-    sight, open_ = new_sight(len(scene.lights.p)), np.zeros((3, 6))
-    _open_attitude(scene.expected, open_)
-    return View(sight, taken, np.empty((3, 3)), np.empty(3), open_, np.empty((6, 6)), np.empty((6, 6)))
+    taken = np.full(len(scene.uv), -1, np.int64)
+    open_ = np.zeros((3, 6))
+    _open_attitude(scene, open_)
+    return View(taken, np.empty((3, 3)), np.empty(3), open_, np.empty((6, 6)), np.empty((6, 6)))
 
 
 @njit(cache=True, error_model="numpy")
-def _open_attitude(expected: Expected, open_: Array) -> None:
+def _open_attitude(scene: Scene, open_: Array) -> None:
     """Add the information (3, 6) that the attitude prior has of a pose; of rotation, the last three columns.
 
     At the expected attitude its Jacobian is, whatever the roll, -y, x and -z of `cam` in dock axes.
@@ -71,35 +69,36 @@ def _open_attitude(expected: Expected, open_: Array) -> None:
         axis = 1 - m if m < 2 else 2
         for k in range(3):
             for o in range(3):
-                open_[k, 3 + o] += expected.info[m] * expected.Rp[k, axis] * expected.Rp[o, axis]
+                open_[k, 3 + o] += scene.info[m] * scene.Rp[k, axis] * scene.Rp[o, axis]
 
 
 @njit(cache=True, error_model="numpy")
-def pair_poses(a: int, b: int, least: int, scene: Scene, view: View, budget: Indices, tries: Array) -> int:
+def pair_poses(
+    a: int, b: int, least: int, scene: Scene, view: View, sight: Sight, budget: Indices, tries: Array
+) -> int:
     """All pairs of detections that lights `a` and `b` may have made.
 
     Fills rows of `tries`: how many other lights of the layer are in place, the two detections, depth of `a`, and roll.
     Pairs with fewer than `least` in place are left out, and all that exceed the `budget` (1,). Returns how many rows.
     """
-    lights, seen, expected = scene
-    n, found, taken = len(seen.uv), 0, view.taken
+    n, found, taken = len(scene.uv), 0, view.taken
     d, sols = np.empty(3), np.empty((2, 2))
     for k in range(3):  # R_cam_dock of the prior is Rp^T
         d[k] = 0.0
         for o in range(3):
-            d[k] += expected.Rp[o, k] * (lights.p[b, o] - lights.p[a, o])
+            d[k] += scene.Rp[o, k] * (scene.p[b, o] - scene.p[a, o])
     for i in range(n):
         for j in range(n):
-            if i == j or not (seen.ray[i, 2] > 0.0 and seen.ray[j, 2] > 0.0):
+            if i == j or not (scene.ray[i, 2] > 0.0 and scene.ray[j, 2] > 0.0):
                 continue
-            for sol in range(_pair_pose(d, seen.ray[i], seen.ray[j], expected.q, sols)):
+            for sol in range(_pair_pose(d, scene.ray[i], scene.ray[j], scene.q, sols)):
                 budget[0] -= 1
                 if budget[0] < 0:
                     return found
                 pair = Pair(a, b, i, j, sols[sol, 0], sols[sol, 1])
-                know_pair(pair, scene, view)
+                know_pair(pair, scene, view, sight.rows[a], sight.P)
                 taken[i], taken[j] = a, b
-                support = in_place(pair, least, scene, view)
+                support = in_place(pair, least, scene, view, sight)
                 taken[i], taken[j] = -1, -1
                 if support >= least:
                     tries[found, 0], tries[found, 1], tries[found, 2] = support, i, j
@@ -139,23 +138,22 @@ def _pair_pose(d: Array, ray_i: Array, ray_j: Array, q: Array, out: Array) -> in
 
 
 @njit(cache=True, error_model="numpy")
-def know_pair(pair: Pair, scene: Scene, view: View) -> None:
-    """Pose and covariance, in `view`, of two named lights and the expected attitude."""
-    lights, seen, expected = scene
+def know_pair(pair: Pair, scene: Scene, view: View, h: Array, P: Array) -> None:
+    """Pose, in `view`, and covariance `P` (6, 6) of two named lights and the expected attitude; `h` (14,) is spare."""
     a, b, i, j, z, roll = pair
     R, t = view.R, view.t
-    _pose_of(expected.Rp, roll, z, seen.ray[i], lights.p[a], R, t)
-    H, h = view.H, view.sight.rows[a]
+    _pose_of(scene.Rp, roll, z, scene.ray[i], scene.p[a], R, t)
+    H = view.H
     H[:3] = 0.0
     H[3:] = view.open
     for k in range(2):
         c, d = (a, i) if k == 0 else (b, j)
-        if light_row(lights.lens, R, t, lights.p[c], h):
-            w = 1.0 / (seen.var[d] + survey_var(lights.lens, R, t, lights.p[c], lights.survey_m2[c]))
+        if light_row(scene.lens, R, t, scene.p[c], h):
+            w = 1.0 / (scene.var[d] + survey_var(scene.lens, R, t, scene.p[c], scene.survey_m2[c]))
             for m in range(6):
                 for o in range(m + 1):
                     H[m, o] += w * (h[2 + m] * h[2 + o] + h[8 + m] * h[8 + o])
-    invert6(H, view.L, view.sight.P)
+    invert6(H, view.L, P)
 
 
 @njit(cache=True, error_model="numpy")
@@ -171,15 +169,15 @@ def _pose_of(Rp: Array, roll: float, z: float, ray: Array, p: Array, R: Array, t
 
 
 @njit(cache=True, error_model="numpy")
-def in_place(pair: Pair, least: int, scene: Scene, view: View) -> int:
+def in_place(pair: Pair, least: int, scene: Scene, view: View, sight: Sight) -> int:
     """How many other lights of the layer have a free detection in their gate; fills the `sight` with where they are.
 
     Ends early where `least` can no longer be reached. One function with its arrays at hand: it is half of all work.
     """
-    lights, seen, sight = scene.lights, scene.seen, view.sight
-    lens, p, layer, survey_m2, uv, var = lights.lens, lights.p, lights.layer, lights.survey_m2, seen.uv, seen.var
+    loosest, by_u = scene.loosest, scene.by_u
+    lens, p, layer, survey_m2, uv, var = scene.lens, scene.p, scene.layer, scene.survey_m2, scene.uv, scene.var
     rows, there, extra, P, R, t, taken = sight.rows, sight.there, sight.extra, sight.P, view.R, view.t, view.taken
-    gate, bend, a, b = scene.expected.q[PAIR_GATE], scene.expected.q[BEND], pair.a, pair.b
+    gate, bend, a, b = scene.q[PAIR_GATE], scene.q[BEND], pair.a, pair.b
     mu, mv = 0.5 * (uv[pair.i, 0] + uv[pair.j, 0]), 0.5 * (uv[pair.i, 1] + uv[pair.j, 1])
     support, left = 0, -2
     for c in range(len(p)):
@@ -198,5 +196,5 @@ def in_place(pair: Pair, least: int, scene: Scene, view: View) -> int:
         du, dv = h[0] - mu, h[1] - mv
         extra[c] = survey_var(lens, R, t, p[c], survey_m2[c]) + bend * (du * du + dv * dv)
         innovation(h, P, extra[c], S)
-        support += occupied(h[0], h[1], S, taken, uv, var, seen.loosest, seen.by_u, gate)
+        support += occupied(h[0], h[1], S, taken, uv, var, loosest, by_u, gate)
     return support

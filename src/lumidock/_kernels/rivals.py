@@ -43,20 +43,20 @@ def other_pose(one: Naming, scene: Scene, level: bool, other: Naming) -> float:
     Found from the flipped pose, or, with `level`, from the expected attitude: lights off the axis leave two solutions
     whose tilts are not opposite. Where the steady part of the prior leads back to the first pose, it counts there.
     """
-    expected, H, L = scene.expected, np.empty((6, 6)), np.empty((6, 6))
-    p, steady = named_points(one.name, scene.lights.p), expected.q[STEADY]
+    H, L = np.empty((6, 6)), np.empty((6, 6))
+    p, steady = named_points(one.name, scene.p), scene.q[STEADY]
     put(other, one)
     if level:
-        _levelled(p, expected.Rp, other.R, other.t)
+        _levelled(p, scene.Rp, other.R, other.t)
     else:
         flip(p, other.R, other.t)
-    wide = solved(other, scene, expected.info, _STEPS_OTHER, H, L)
+    wide = solved(other, scene, scene.info, _STEPS_OTHER, H, L)
     if wide <= -HUGE or turn(one.R, other.R) < SAME_TURN:
         return -HUGE
     if steady <= 0.0:
         return wide
     held = copied(other)
-    narrow = solved(held, scene, expected.steady, _STEPS_OTHER, H, L) + math.log(steady)
+    narrow = solved(held, scene, scene.steady, _STEPS_OTHER, H, L) + math.log(steady)
     wide += math.log(1.0 - steady)
     return log_add(wide, narrow) if turn(one.R, held.R) > turn(other.R, held.R) else wide
 
@@ -140,17 +140,17 @@ def _exchanged(
 
     `name` (M,) are all names; `less` is without that of `c`, its pose of covariance `P`.
     """
-    lights, seen, gate = scene.lights, scene.seen, _FAR_GATES * scene.expected.q[GATE]
+    gate = _FAR_GATES * scene.q[GATE]
     i, h, S = name[c], np.empty(14), np.empty(3)
     H, L = np.empty((6, 6)), np.empty((6, 6))
     for c2 in range(len(name)):
-        if (c2 < c and name[c2] >= 0) or not light_row(lights.lens, less.R, less.t, lights.p[c2], h):
+        if (c2 < c and name[c2] >= 0) or not light_row(scene.lens, less.R, less.t, scene.p[c2], h):
             continue
-        innovation(h, P, survey_var(lights.lens, less.R, less.t, lights.p[c2], lights.survey_m2[c2]), S)
-        for k in range(len(seen.uv)):
+        innovation(h, P, survey_var(scene.lens, less.R, less.t, scene.p[c2], scene.survey_m2[c2]), S)
+        for k in range(len(scene.uv)):
             if (c2 == c and (k == i or taken[k] >= 0)) or (c2 != c and k != i):
                 continue
-            if nis(seen.uv[k, 0] - h[0], seen.uv[k, 1] - h[1], S, seen.var[k])[0] > gate:
+            if nis(scene.uv[k, 0] - h[0], scene.uv[k, 1] - h[1], S, scene.var[k])[0] > gate:
                 continue
             one, j = copied(less), name[c2]
             one.name[c], one.name[c2] = j if c2 != c else -1, k

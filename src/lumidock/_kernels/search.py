@@ -25,7 +25,7 @@ from lumidock._kernels.evidence import (
     log_evidence,
     named,
 )
-from lumidock._kernels.gates import ANY, cheapest, look, new_sight, support
+from lumidock._kernels.gates import ANY, Sight, cheapest, look, new_sight, support
 from lumidock._kernels.grow import NONE, extend, grow
 from lumidock._kernels.lens import invert6
 from lumidock._kernels.pairs import Pair, View, in_place, know_pair, new_view, pair_poses
@@ -66,21 +66,21 @@ def search(scene: Scene, pairs: Indices, unseen: Indices, goal: Goal, count: int
     light of the best, in all or in any one layer, so that it is exhaustive in what matters; or when its budget is
     spent, which then is negative. Of a pair of lights those detections come first that leave most others in place.
     """
-    n, layers = scene.seen.like.shape
-    view = new_view(scene)
+    n, layers = scene.like.shape
+    view, sight = new_view(scene), new_sight(len(scene.p))
     tries = np.empty((2 * n * n, 5))
     thirds = np.empty((_THIRDS if goal.bounds[0] > 3 else _ALL_THIRDS, 3))
     for s in range(len(pairs)):
         if unseen[s] < _wanted(goal, layers):
             break
         a, b = pairs[s]
-        found = pair_poses(a, b, max(_wanted(goal, layers) - 2, 1), scene, view, goal.budget, tries)
+        found = pair_poses(a, b, max(_wanted(goal, layers) - 2, 1), scene, view, sight, goal.budget, tries)
         order = np.argsort(-tries[:found, 0], kind="mergesort")
         for o in order:
             if tries[o, 0] < max(_wanted(goal, layers) - 2, 1):
                 break
             pair = Pair(a, b, int(tries[o, 1]), int(tries[o, 2]), tries[o, 3], tries[o, 4])
-            count = _try_pair(pair, scene, view, thirds, goal, count, listed)
+            count = _try_pair(pair, scene, view, sight, thirds, goal, count, listed)
         if goal.budget[0] < 0:
             break
     for k in range(count):
@@ -97,25 +97,27 @@ def _wanted(goal: Goal, layers: int) -> int:
 
 
 @njit(cache=True, error_model="numpy")
-def _try_pair(pair: Pair, scene: Scene, view: View, thirds: Array, goal: Goal, count: int, listed: Listed) -> int:
+def _try_pair(
+    pair: Pair, scene: Scene, view: View, sight: Sight, thirds: Array, goal: Goal, count: int, listed: Listed
+) -> int:
     """Grow namings from a pair and a third light, and list them. Each triple is tried once: the third ranks last."""
-    seen, rank, gate, taken = scene.seen, scene.lights.rank, scene.expected.q[PAIR_GATE], view.taken
+    rank, gate, taken = scene.rank, scene.q[PAIR_GATE], view.taken
     a, b, i, j = pair.a, pair.b, pair.i, pair.j
-    name, layers = np.empty(len(rank), np.int64), seen.like.shape[1]
+    name, layers = np.empty(len(rank), np.int64), scene.like.shape[1]
     taken[i], taken[j] = a, b
-    know_pair(pair, scene, view)
-    in_place(pair, NONE, scene, view)
-    found, _ = cheapest(max(rank[a], rank[b]), view.sight, taken, scene, gate, thirds)
+    know_pair(pair, scene, view, sight.rows[a], sight.P)
+    in_place(pair, NONE, scene, view, sight)
+    found, _ = cheapest(max(rank[a], rank[b]), sight, taken, scene, gate, thirds)
     for k in range(found):
         c, o = int(thirds[k, 1]), int(thirds[k, 2])
         if _known(pair, c, o, listed.names, count):
             continue
         wanted = _wanted(goal, layers)
-        if wanted > 3 and wanted > 3 + support(c, o, view.sight, taken, scene, seen.var, seen.loosest, gate):
+        if wanted > 3 and wanted > 3 + support(c, o, sight, taken, scene, scene.var, scene.loosest, gate):
             continue
         name[:] = -1
         name[a], name[b], name[c], taken[o] = i, j, o, c
-        count = _try_three(Naming(name, view.R, view.t), taken, scene.lights.layer[a], scene, goal, count, listed)
+        count = _try_three(Naming(name, view.R, view.t), taken, scene.layer[a], scene, goal, count, listed)
         taken[o] = -1
     taken[i], taken[j] = -1, -1
     return count
@@ -133,13 +135,13 @@ def _known(pair: Pair, c: int, o: int, names: Indices, count: int) -> bool:
 @njit(cache=True, error_model="numpy")
 def _try_three(three: Naming, held: Indices, layer: int, scene: Scene, goal: Goal, count: int, listed: Listed) -> int:
     """Grow namings from three, and list them: the cheapest fourth light first, then others that it led away from."""
-    layers, fourths, sight = scene.seen.like.shape[1], np.empty((_FOURTHS, 3)), new_sight(len(three.name))
+    layers, fourths, sight = scene.like.shape[1], np.empty((_FOURTHS, 3)), new_sight(len(three.name))
     H, L, start = np.empty((6, 6)), np.empty((6, 6)), copied(three)
-    fit(start, scene, scene.expected.info, STEPS, H, L)
+    fit(start, scene, scene.info, STEPS, H, L)
     if math.isnan(invert6(H, L, sight.P)):
         return count
     look(layer, start, scene, sight)
-    found, near = cheapest(ANY, sight, held, scene, scene.expected.q[GATE], fourths)
+    found, near = cheapest(ANY, sight, held, scene, scene.q[GATE], fourths)
     first = start.name
     for k in range(max(found, 1)):
         if 3 + near < _wanted(goal, layers):
@@ -155,15 +157,15 @@ def _try_three(three: Naming, held: Indices, layer: int, scene: Scene, goal: Goa
             first = one.name
         if e > -HUGE and named(one.name) >= goal.bounds[1]:
             count = _store(one, e, count, listed)
-            _aim(one.name, e, scene.lights.layer, layers, goal)
+            _aim(one.name, e, scene.layer, layers, goal)
     return count
 
 
 @njit(cache=True, error_model="numpy")
 def _grown(layer: int, one: Naming, taken: Indices, scene: Scene, goal: Goal) -> float:
     """Log evidence of a naming of one layer, grown in place: first within the layer, then over all."""
-    fitted = grow(layer, one, taken, scene, _wanted(goal, scene.seen.like.shape[1]))
-    e = log_evidence(one, scene, scene.expected.info, fitted)
+    fitted = grow(layer, one, taken, scene, _wanted(goal, scene.like.shape[1]))
+    e = log_evidence(one, scene, scene.info, fitted)
     if e <= -HUGE or named(one.name) < goal.bounds[0]:
         return -HUGE
     if e > goal.best[0] - _CLOSE or (e > 0.0 and named(one.name) > 3):
