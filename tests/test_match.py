@@ -226,7 +226,7 @@ def test_pairs_come_once_in_one_layer_and_count_down_what_is_unseen():
     for lights in map(STATION.lights_of, STATION.layers):
         mine = [tuple(sorted(pair)) for pair in PLAN.pairs.tolist() if pair[0] in lights]
         assert len(mine) == len(set(mine)) == len(lights) * (len(lights) - 1) // 2
-        assert_array_equal(np.sort(PLAN.direct.rank[lights]), np.arange(len(lights)))
+        assert_array_equal(np.sort(PLAN.rank[lights]), np.arange(len(lights)))
     assert (STATION.layer[PLAN.pairs[:, 0]] == STATION.layer[PLAN.pairs[:, 1]]).all()
     assert (np.diff(PLAN.unseen) <= 0).all()
     # by definition: the most lights of one layer, no two of which are a pair before
