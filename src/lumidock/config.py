@@ -214,7 +214,7 @@ class MatchConfig(Section):
     lead: PositiveFloat = 3.5  # log odds by which a naming gathered over frames must lead in the last one alone
     min_layer: PositiveInt = 3  # fewer lights of a second layer stay unnamed without history: they would set the tilt
     enough: PositiveInt = 4  # names that let the doubtful ones be dropped
-    extra: PositiveFloat = 8.5  # log odds of a name that a lock does not need
+    extra: PositiveFloat = 7.5  # log odds of a name that a lock does not need
     prune: PositiveFloat = 5.0  # log odds below which a single name is dropped in any case
     keep: PositiveFloat = 14.0  # candidates this far below the best are forgotten
     log_mirror: float = -8.1  # log prior of seeing the mirror image alone

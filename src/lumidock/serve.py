@@ -27,6 +27,7 @@ _TICK_S = 0.2  # between looks at a sink that has nothing to do
 _LOOK_S = 0.05  # that a recording waits at most for a picture to be looked at
 _RETRY_S = 1.0  # until a lost camera or a failed sink is tried again
 _AFTER_YOU_S = 0.01  # in which the vehicle is told, before what can wait takes the processor
+_OPENING_S = 2.0  # all sinks together may take before the first frame
 _CLOSING_S = 5.0  # a sink may take to write what is left
 _LOOP_PAUSE_NS = 3_000_000_000  # between two passes over a recording: no track is carried across
 STALE_S = 0.25  # ArduPilot takes an estimate for lost after 0.3
@@ -167,6 +168,7 @@ class Worker(threading.Thread):
         self._open, self._queue, self._stale_s = open_sink, deque[Done](maxlen=queue), stale_s
         self._pictures, self._patient = pictures, patient
         self._changed, self._halt = threading.Condition(), False
+        self.tried = threading.Event()  # whether the sink has been opened, well or not
         self.sent, self.dropped, self.stale, self.errors, self.problem = 0, 0, 0, 0, ""
         self.delay_s = deque[float](maxlen=_RECENT)  # from the frame's arrival to the end of sending
 
@@ -189,6 +191,7 @@ class Worker(threading.Thread):
         while not self._over():
             try:
                 sink = self._open()
+                self.tried.set()
                 try:
                     self._feed(sink)
                 finally:
@@ -196,6 +199,7 @@ class Worker(threading.Thread):
             except (OSError, LumidockError, RuntimeError, ValueError) as error:
                 self.errors += 1
                 self.problem = " ".join(str(error).split()) or type(error).__name__
+                self.tried.set()
                 self._pause()
 
     def _over(self) -> bool:
@@ -260,6 +264,9 @@ class Server:
         gc.freeze()  # what is alive now stays, and would be looked at in every long pause of the collector
         for worker in self.workers:
             worker.start()
+        ready_s = time.monotonic() + _OPENING_S
+        for worker in self.workers:  # what is slow to open would be behind from the first frame on
+            worker.tried.wait(max(0.0, ready_s - time.monotonic()))
         self.camera.start()
         try:
             while not self.stop.is_set():
