@@ -14,23 +14,23 @@ from lumidock.sim.plan import plan_of
 from lumidock.sim.scenario import R_DOCK_CAM_HEAD_ON, load_scenario
 
 SHEET = Path("docs/contact-sheet.jpg")
-ROWS = {  # scenario, further settings
-    "Jerlov IB": ("water-ib", ()),
-    "Jerlov III": ("approach", ()),
-    "Jerlov 3C, 6 ms": ("water-3c", ()),
-    "clear pool": ("pool", ()),
-    "murky pool": ("pool-murky", ()),
-    "own headlamp, snow": ("headlamp", ()),
+ROWS = {
+    "Jerlov IB": "water-ib",
+    "Jerlov III": "approach",
+    "Jerlov 3C, 6 ms": "water-3c",
+    "clear pool": "pool",
+    "murky pool": "pool-murky",
+    "own headlamp, snow": "headlamp",
 }
 RANGES_M = (18.0, 9.0, 3.0, -2.0)
 _TILE, _GAP = (460, 384), 4
-_MARGIN = 1.7  # of the dock's size, which fills each tile
+_MARGIN, _DOCK_M = 1.7, 2.0  # of the dock's size, which fills each tile
 
 
-def picture(scenario: str, settings: tuple[str, ...], z_m: float) -> Image:
+def picture(scenario: str, z_m: float) -> Image:
     """A frame from the dock's axis."""
     station = shipped_station()
-    plan = plan_of(load_scenario(scenario, settings), station, shipped_camera(), 0)
+    plan = plan_of(load_scenario(scenario), station, shipped_camera(), 0)
     T_dock_cam = np.eye(4)
     T_dock_cam[:3, :3], T_dock_cam[2, 3] = R_DOCK_CAM_HEAD_ON, z_m
     moment = replace(plan.moment(0), t_s=30.0 - z_m, T_dock_cam=T_dock_cam, T_cam_later=np.eye(4))
@@ -41,7 +41,7 @@ def picture(scenario: str, settings: tuple[str, ...], z_m: float) -> Image:
 def tile(image: Image, z_m: float) -> Image:
     """The part of a frame around the dock, larger the farther it is; at most the whole frame."""
     height, width = image.shape[:2]
-    span = min(_MARGIN * 2.0 * 2087.0 / max(z_m, 0.1), float(height))
+    span = min(_MARGIN * _DOCK_M * float(shipped_camera().focal_px[1]) / max(z_m, 0.1), float(height))
     half = np.array([span * _TILE[0] / _TILE[1], span]) / 2.0
     (u0, v0), (u1, v1) = (np.clip(np.array([width, height]) / 2 + sign * half, 0, [width, height]) for sign in (-1, 1))
     part = image[int(v0) : int(v1), int(u0) : int(u1)]
@@ -51,8 +51,8 @@ def tile(image: Image, z_m: float) -> Image:
 def main() -> tuple[dict[str, object], list[str]]:
     """Draw and save it."""
     rows = []
-    for name, (scenario, settings) in ROWS.items():
-        tiles = [tile(picture(scenario, settings, z), z) for z in RANGES_M]
+    for name, scenario in ROWS.items():
+        tiles = [tile(picture(scenario, z), z) for z in RANGES_M]
         for image, z in zip(tiles, RANGES_M, strict=True):
             text = name if z == RANGES_M[0] else ""
             cv2.putText(image, text, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (230, 230, 230), 1, cv2.LINE_AA)

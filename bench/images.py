@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -12,7 +11,7 @@ import numpy as np
 from bench.shipped import CAMERA_FILE, STATION_FILE, shipped_camera, shipped_station
 from lumidock.config import Config, ExtractConfig
 from lumidock.datatypes import Frame
-from lumidock.metrics import evaluate
+from lumidock.metrics import evaluate, read_rows
 from lumidock.paper import PaperLocalizer, extract
 from lumidock.run import Setup, run
 from lumidock.sim.scenario import load_scenario, trajectory
@@ -39,10 +38,10 @@ def simulate_and_run(scenario: str, seed: int, folder: Path) -> tuple[Path, Path
 def search_labels(sequence: Path, out: Path) -> tuple[int, int]:
     """Frames with four or more front lights detected and no other spot taken for front; those of them named right."""
     true: dict[str, dict[str, np.ndarray]] = {}
-    for row in _rows(sequence / "lights_truth.csv"):
+    for row in read_rows(sequence / "lights_truth.csv", ("frame", "light", "u_px", "v_px")):
         true.setdefault(row["frame"], {})[row["light"]] = np.array([float(row["u_px"]), float(row["v_px"])])
     spots: dict[str, list[dict[str, str]]] = {}
-    for row in _rows(out / "lights.csv"):
+    for row in read_rows(out / "lights.csv", ("frame", "light", "u_px", "v_px", "p_rear")):
         spots.setdefault(row["frame"], []).append(row)
     eligible = right = 0
     for frame, rows in spots.items():
@@ -58,11 +57,6 @@ def _maker(spot: dict[str, str], lights: dict[str, np.ndarray]) -> str:
     at = np.array([float(spot["u_px"]), float(spot["v_px"])])
     light = min(lights, key=lambda name: float(np.hypot(*(lights[name] - at))), default="")
     return light if light and np.hypot(*(lights[light] - at)) < _SAME_SPOT_PX else ""
-
-
-def _rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def rear_reach_m(gray: Literal["max", "luma"], seed: int) -> float:

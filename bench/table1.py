@@ -14,12 +14,11 @@ from multiprocessing import get_context
 from bench.shipped import shipped_camera, shipped_station
 from lumidock.reproduce import trials
 from lumidock.reproduce.paper import TABLE_1
+from lumidock.reproduce.plan import ROWS
 from lumidock.reproduce.trials import Counts
 
 TRIALS = 30
 FIRST_SEED = 20_000
-PAPER = TABLE_1
-CONDITIONS = (*PAPER, (1, 1))
 
 
 def trial(missing: int, spurious: int, seed: int, *, clean_start: bool = False) -> Counts:
@@ -27,13 +26,11 @@ def trial(missing: int, spurious: int, seed: int, *, clean_start: bool = False) 
     return trials.trial(shipped_station(), shipped_camera(), missing, spurious, seed, clean_start=clean_start)
 
 
-def condition(
-    missing: int, spurious: int, trials: int = TRIALS, first_seed: int = FIRST_SEED, *, clean_start: bool = False
-) -> Counts:
+def condition(missing: int, spurious: int, first_seed: int = FIRST_SEED, *, clean_start: bool = False) -> Counts:
     """All trials of one condition, on all cores."""
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
         job = partial(trial, missing, spurious, clean_start=clean_start)
-        return sum(pool.map(job, range(first_seed, first_seed + trials)), Counts())
+        return sum(pool.map(job, range(first_seed, first_seed + TRIALS)), Counts())
 
 
 def main() -> tuple[dict[str, object], list[str]]:
@@ -44,10 +41,9 @@ def main() -> tuple[dict[str, object], list[str]]:
         "|---|---|---|---|---|---|---|---|",
     ]
     content: dict[str, object] = {}
-    rows = [(*condition_, False) for condition_ in CONDITIONS] + [(1, 1, True), (3, 2, True)]
-    for missing, spurious, clean_start in rows:
+    for missing, spurious, clean_start in ROWS:
         counts = condition(missing, spurious, clean_start=clean_start)
-        paper = ("-", "-") if clean_start else PAPER.get((missing, spurious), ("-", "-"))
+        paper = ("-", "-") if clean_start else TABLE_1.get((missing, spurious), ("-", "-"))
         swarm, whole = (100.0 * n / counts.frames for n in (counts.swarm_right, counts.right))
         name = f"{missing} + {spurious}{', after a clean start' * clean_start}"
         lines.append(

@@ -5,7 +5,6 @@ Every third frame of the camera's 6.7 a second, so that the table takes minutes.
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -15,39 +14,40 @@ from bench.detection import simulate
 from bench.shipped import CAMERA_FILE, STATION_FILE, shipped_camera, shipped_station
 from lumidock.config import Config
 from lumidock.localizer import Localizer
-from lumidock.metrics import evaluate
+from lumidock.metrics import evaluate, read_rows, true_poses
 from lumidock.run import Setup, run
 from lumidock.streams.runfolder import RunFolder
 from lumidock.streams.sources import open_source
 
 SEED, INTERVAL_S = 7200, 0.45
 WATERS = {
-    "III, 2 ms": ("approach",),
-    "clear IB": ("water-ib",),
-    "pool": ("pool",),
-    "coastal 1C, 6 ms": ("water-1c",),
-    "bright": ("shallow",),
-    "fouled": ("fouling",),
-    "headlamp": ("headlamp",),
+    "III, 2 ms": "approach",
+    "clear IB": "water-ib",
+    "pool": "pool",
+    "coastal 1C, 6 ms": "water-1c",
+    "bright": "shallow",
+    "fouled": "fouling",
+    "headlamp": "headlamp",
 }
 _NEAR_M = (5.0, 7.0)
 
 
-def docking(scenario: str, settings: tuple[str, ...], seed: int) -> dict[str, float]:
+def docking(scenario: str, seed: int) -> dict[str, float]:
     """Figures of one run: z of the first guide and of three valid poses in a row, gaps after, errors, hazards."""
     with TemporaryDirectory() as name:
         sequence, out = Path(name) / "s", Path(name) / "run"
-        simulate(scenario, seed, sequence, f"path.frame_interval_s={INTERVAL_S}", *settings)
+        simulate(scenario, seed, sequence, f"path.frame_interval_s={INTERVAL_S}")
         setup = Setup("lumidock", False, Config(), STATION_FILE, CAMERA_FILE)
         station = shipped_station()
         with RunFolder(out, station.ids) as folder:
             (out / "station.yaml").write_bytes(STATION_FILE.read_bytes())
             run(open_source(sequence), Localizer(station, shipped_camera()), folder, setup)
-        return _figures(_rows(out / "fixes.csv"), _rows(sequence / "truth.csv")) | _judged(evaluate(out, sequence))
+        return _figures(out, sequence) | _judged(evaluate(out, sequence))
 
 
-def _figures(fixes: list[dict[str, str]], truth: list[dict[str, str]]) -> dict[str, float]:
-    at = {row["frame"]: np.array([float(row[k]) for k in ("x_m", "y_m", "z_m")]) for row in truth}
+def _figures(run_folder: Path, sequence: Path) -> dict[str, float]:
+    at = {name: T_dock_cam[:3, 3] for name, T_dock_cam in true_poses(sequence).items()}
+    fixes = read_rows(run_folder / "fixes.csv", ("frame", "valid", "guide", "range_m"))
     known = [row for row in fixes if row["frame"] in at]
     valid = np.array([row["valid"] == "1" for row in known])
     z = np.array([at[row["frame"]][2] for row in known])
@@ -81,19 +81,14 @@ def _judged(result: dict[str, object]) -> dict[str, float]:
     return {"wrong": wrong, "hazardous": float(hazards["valid"]["any"] + hazards["guide"]["any"])}
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def main() -> tuple[dict[str, object], list[str]]:
     """One row a water."""
     names = ("first guide, z m", "three valid, z m", "last valid, z m", "frames missed in a row after")
     names = (*names, "range error 5-7 m, mean / 95 %, mm", "wrong names", "hazardous")
     lines = ["| water | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
     content: dict[str, object] = {}
-    for water, (scenario, *settings) in WATERS.items():
-        f = docking(scenario, tuple(settings), SEED)
+    for water, scenario in WATERS.items():
+        f = docking(scenario, SEED)
         content[water] = f
         lines.append(
             f"| {water} | {f['first_guide_m']:.1f} | {f['first_valid_m']:.1f} | {f['last_valid_m']:.2f} | "

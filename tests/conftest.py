@@ -1,16 +1,22 @@
-"""What the tests share: seeded draws, strategies for SE(3), numeric derivatives, closeness, refusals."""
+"""What the tests share: seeded draws, strategies for SE(3), numeric derivatives, closeness, refusals, a small run."""
 
+import shutil
+import socket
 import sys
 import zlib
 from contextlib import contextmanager
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from commandline import PAPER
 from hypothesis import settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from pymavlink.dialects.v20 import common
 from scipy.spatial.transform import Rotation
+from test_run import simulate
 
 from lumidock import cli
 from lumidock.errors import InputError
@@ -95,3 +101,61 @@ def lumidock(monkeypatch, capfd):
         return exited.value.code, *capfd.readouterr()
 
     return call
+
+
+@pytest.fixture
+def refusal(lumidock):
+    """Run the command line where it must refuse; returns its one line."""
+
+    def call(*words):
+        code, out, err = lumidock(*words)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert err.startswith("lumidock: ")
+        return err
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def bare(tmp_path_factory):
+    """A sequence of bare detections, which no test may change."""
+    return simulate(tmp_path_factory.mktemp("bare"), bare=True)
+
+
+@pytest.fixture
+def sequence(bare, tmp_path):
+    """A sequence of bare detections that a test may spoil."""
+    return shutil.copytree(bare, tmp_path / "sequence")
+
+
+@pytest.fixture
+def earlier(lumidock, bare, tmp_path):
+    """An earlier run over it."""
+    assert lumidock("run", bare, *PAPER, "--out", tmp_path / "earlier")[0] == 0
+    return tmp_path / "earlier"
+
+
+@pytest.fixture
+def listener():
+    """A UDP port and a function that reads all MAVLink messages that came to it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
+        port.bind(("127.0.0.1", 0))
+        port.setblocking(False)
+        link, sender = common.MAVLink(None), []
+
+        def read():
+            found = []
+            while True:
+                try:
+                    content, address = port.recvfrom(4096)
+                except BlockingIOError:
+                    return found
+                sender[:] = [address]
+                found += link.parse_buffer(content) or []
+
+        def peer():
+            """Address of who sent last."""
+            read()
+            return sender[0]
+
+        yield SimpleNamespace(port=port.getsockname()[1], read=read, peer=peer)

@@ -10,10 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import zenoh
+from commandline import AHEAD, wait_for
 from conftest import assert_close
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_run import CAMERA
-from test_serve import AHEAD, wait_for
 from zenoh.ext import Int64, z_deserialize
 
 from lumidock.datatypes import Fix, Frame

@@ -16,6 +16,7 @@ from lumidock.geometry import se3_inverse, so3_log
 from lumidock.metrics import evaluate
 from lumidock.paper import PaperLocalizer
 from lumidock.pose import project_lights
+from lumidock.reproduce.paper import TABLE_1
 from lumidock.sim.scenario import Scenario, load_scenario
 from lumidock.sim.sequence import render_frame
 from lumidock.sim.spots import spot_frames
@@ -210,7 +211,7 @@ def test_image_door_finds_both_layers(rng):
     assert mono.n_seen == 13
 
 
-@pytest.mark.parametrize(("missing", "spurious"), list(table1.PAPER))
+@pytest.mark.parametrize(("missing", "spurious"), list(TABLE_1))
 def test_table_1_holds_on_a_few_trials(missing, spurious):
     counts = sum((table1.trial(missing, spurious, seed) for seed in (900, 901, 902)), table1.Counts())
     wanted = {(3, 0): 90.3, (2, 0): 98.6, (1, 0): 99.9, (0, 1): 99.6, (0, 2): 99.6}[missing, spurious]
@@ -221,7 +222,7 @@ def test_table_1_holds_on_a_few_trials(missing, spurious):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("missing", "spurious"), list(table1.PAPER))
+@pytest.mark.parametrize(("missing", "spurious"), list(TABLE_1))
 def test_table_1_holds_on_thirty_trials(missing, spurious):
     counts = table1.condition(missing, spurious, first_seed=40_000)
     wanted = {(3, 0): 90.3, (2, 0): 98.6, (1, 0): 99.9, (0, 1): 99.6, (0, 2): 99.6}[missing, spurious]

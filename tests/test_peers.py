@@ -16,10 +16,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from commandline import LUMIDOCK, VEHICLE, fixes, free_port, serve, wait_for
 from conftest import assert_close
 from rosbags.typesys import Stores, get_typestore
 from test_run import simulate
-from test_serve import VEHICLE, start, wait_for
 
 from lumidock.calib import write_calibration
 from lumidock.camera import Camera, load_camera, save_camera
@@ -32,7 +32,6 @@ from lumidock.vehicle import load_vehicle
 
 pytestmark = pytest.mark.peers
 
-LUMIDOCK = str(Path(sys.executable).with_name("lumidock"))
 SCRIPTS = Path(__file__).parent / "peers"
 FETCHED = Path(__file__).parents[1] / ".peers"
 SYSTEM_PYTHON = "/usr/bin/python3"
@@ -86,11 +85,6 @@ def made(tmp_path_factory):
     return folder
 
 
-def rows(run):
-    with (run / "fixes.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 
@@ -103,7 +97,7 @@ def test_foxgloves_decoders_read_our_mcap(made):
     found = {}
     for line in node("mcap.cjs", made / "fixes.mcap"):
         found.setdefault(line["topic"], []).append(line)
-    valid = [row for row in rows(made / "run") if row["valid"] == "1"]
+    valid = [row for row in fixes(made / "run") if row["valid"] == "1"]
     assert len(found["/lumidock/status"]) == 7
     assert [line["t_ns"] for line in found["/lumidock/pose"]] == [row["t_ns"] for row in valid]
     for line, row in zip(found["/lumidock/pose"], valid, strict=True):
@@ -155,7 +149,7 @@ def test_evo_takes_our_trajectory_and_finds_the_same_error(made, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     rmse = float(next(line.split()[1] for line in done.stdout.splitlines() if "rmse" in line))
-    valid = {row["frame"]: row for row in rows(made / "run") if row["valid"] == "1"}
+    valid = {row["frame"]: row for row in fixes(made / "run") if row["valid"] == "1"}
     with (made / "seq" / "truth.csv").open(newline="") as file:
         true = {row["frame"]: row for row in csv.DictReader(file)}
     errors = [[float(row[n]) - float(true[frame][n]) for n in POSE[:3]] for frame, row in valid.items()]
@@ -203,7 +197,7 @@ def test_fast_dds_receives_poses_and_status(made, fast_dds):
     command = [str(fast_dds), "77", "rt/lumidock/pose", kind, "3"]
     reader = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert reader.stdout.readline() == "ready\n"
-    served = start(made / "seq", "--loop", "--dds", "--domain", "77")
+    served = serve(made / "seq", "--loop", "--dds", "--domain", "77")
     timer = threading.Timer(40.0, reader.kill)
     timer.start()
     try:
@@ -214,7 +208,7 @@ def test_fast_dds_receives_poses_and_status(made, fast_dds):
         served.communicate()
         reader.wait()
     assert len(lines) == 3
-    known = [[float(row[name]) for name in POSE] for row in rows(made / "run") if row["valid"] == "1"]
+    known = [[float(row[name]) for name in POSE] for row in fixes(made / "run") if row["valid"] == "1"]
     for line in lines:
         message = store.deserialize_cdr(bytes.fromhex(line), "geometry_msgs/msg/PoseWithCovarianceStamped")
         p, q = message.pose.pose.position, message.pose.pose.orientation
@@ -258,16 +252,10 @@ def test_ffprobe_plays_our_video(made):
     )
 
 
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 def test_foxglove_connects_to_a_server(made):
     port = free_port()
     more = ("--vehicle", made / "vehicle.yaml", "--foxglove", "--foxglove-port", port)
-    served = start(made / "seq", "--loop", *more)
+    served = serve(made / "seq", "--loop", *more)
     try:
         wait_for(lambda: socket.socket().connect_ex(("127.0.0.1", port)) == 0)
         found = {line["topic"]: line["content"] for line in node("foxglove.cjs", port, 7)}
@@ -328,7 +316,7 @@ def test_serve_comes_back_to_a_camera_that_was_lost(rtsp, made, tmp_path):
     save_camera(camera, tmp_path / "camera.yaml")
     first = rtsp(port)
     options = ("--station", made / "seq" / "station.yaml", "--camera", tmp_path / "camera.yaml")
-    served = start(f"rtsp://127.0.0.1:{port}/front", *options)
+    served = serve(f"rtsp://127.0.0.1:{port}/front", *options)
 
     def health():
         import urllib.request

@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from test_serve import LUMIDOCK, VEHICLE, listener, start, wait_for  # noqa: F401  # a fixture
+from commandline import LUMIDOCK, VEHICLE, free_port, serve, wait_for
 
 SECONDS = float(os.environ.get("LUMIDOCK_SOAK_S", "600"))
 SIM = ("path.frame_interval_s=0.0667", "path.start_z_m=9", "path.end_z_m=4")
@@ -49,16 +49,14 @@ def memory_mib(pid):
 
 
 @pytest.mark.slow
-def test_ten_minutes_without_growth_or_delay(tmp_path, listener):  # noqa: F811
+def test_ten_minutes_without_growth_or_delay(tmp_path, listener):
     sim = [word for setting in SIM for word in ("--set", setting)]
     made = subprocess.run([LUMIDOCK, "sim", "approach", *sim, "--out", str(tmp_path / "seq")], capture_output=True)
     assert made.returncode == 0, made.stderr
     (tmp_path / "vehicle.yaml").write_text(VEHICLE)
     (tmp_path / "full.mcap").symlink_to("/dev/full")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    served = start(
+    port = free_port()
+    served = serve(
         *(
             tmp_path / "seq",
             "--loop",

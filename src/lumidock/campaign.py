@@ -23,7 +23,7 @@ from functools import cache
 from importlib.metadata import version
 from multiprocessing import get_context, parent_process
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,24 +32,17 @@ from lumidock.bound import Bound
 from lumidock.camera import Camera, load_camera
 from lumidock.campaign_table import markdown, row_of
 from lumidock.config import Config
-from lumidock.datatypes import Detections, Fix
 from lumidock.errors import InputError, LumidockError
+from lumidock.methods import TwoDoors, localizer_of
 from lumidock.sim.scenario import Scenario
 from lumidock.sim.spots import SpotFrame, spot_frames
 from lumidock.station import Station, load_station
 from lumidock.tally import Run, Tally, tally_run
 from lumidock.yamlfile import validate
 
-METHODS = ("lumidock", "paper")
 _SEEDS_PER_SHARD = 5
 _MAX_POOLS = 4  # a worker that dies takes its pool with it; the shards that are left get so many in all
 Progress = Callable[[int, int | None], None]
-
-
-class _LightDoor(Protocol):
-    def process_detections(self, detections: Detections) -> Fix: ...
-
-    def forget(self) -> None: ...
 
 
 # Shards
@@ -81,13 +74,13 @@ def run_shard(shard: Shard) -> dict[str, Any]:
     """Counts of one shard, and the seconds that it took; made in a worker."""
     cv2.setNumThreads(1)
     start, tally = time.perf_counter(), Tally()
-    localizer = _localizer(shard)
+    localizer = localizer_of(shard.method, shard.station, shard.camera, shard.config, cold=shard.cold)
     for seed in range(shard.first, shard.stop):
         tally.merge(tally_run(run_seed(shard, localizer, seed)))
     return {"key": shard.key, "tally": tally.as_dict(), "seconds": time.perf_counter() - start}
 
 
-def run_seed(shard: Shard, localizer: _LightDoor, seed: int) -> Run:
+def run_seed(shard: Shard, localizer: TwoDoors, seed: int) -> Run:
     """One seed through the light door; a sequence begins without history."""
     frames = list(spot_frames(shard.scenario, shard.station, shard.camera, seed))
     fixes = []
@@ -108,16 +101,6 @@ def _owed(shard: Shard, frames: Sequence[SpotFrame]) -> np.ndarray:
         lights = frame.light[frame.light >= 0]
         owed[k] = bound.owes(frame.detections.t_ns, frame.T_dock_cam, lights)
     return owed
-
-
-def _localizer(shard: Shard) -> _LightDoor:
-    if shard.method == "paper":
-        from lumidock.paper import PaperLocalizer
-
-        return PaperLocalizer(shard.station, shard.camera, shard.config.paper, cold=shard.cold)
-    from lumidock.localizer import Localizer
-
-    return Localizer(shard.station, shard.camera, shard.config, cold=shard.cold)
 
 
 # A campaign

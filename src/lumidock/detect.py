@@ -19,7 +19,6 @@ from lumidock._kernels import fields, tiles
 from lumidock.config import DetectConfig
 from lumidock.datatypes import Array, Detections, Frame, Indices
 
-_PLANES = {"mono": 1, "bgr": 3, "bayer": 4}
 _SATURATED = 250.0  # of 255
 _SIXTEEN = 255.0 / 65535.0  # 8-bit levels of a 16-bit step
 _TWELVE_BITS = 16.0  # steps of a sensor of 12 bits in 16

@@ -19,7 +19,6 @@ from lumidock.geometry import pose_from_quat, se3_inverse, transform_points
 from lumidock.station import Station, load_station
 from lumidock.streams.runfolder import COVARIANCE_COLUMNS, GUIDE_COLUMNS, PROTECTION_COLUMNS
 from lumidock.trust import GuideClaims, PoseClaims
-from lumidock.trust import stanford as stanford
 
 _POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _SAME_SPOT_PX = 3.0  # a named detection this close to its light's true centre was made by it

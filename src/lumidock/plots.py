@@ -26,13 +26,13 @@ _DECIMALS = re.compile(r"(\.\d\d)\d+")  # of points; more cannot be seen
 Draw = Callable[["Figure", bool], None]
 
 
-def plot(name: str, caption: str, draw: Draw, *, height_in: float, narrow_height_in: float | None = None) -> Plot:
-    """A figure by `draw(figure, narrow)`, `height_in` inches high where a wide one is 10 and a narrow one 4.6 wide.
+def plot(name: str, caption: str, draw: Draw, heights_in: tuple[float, float]) -> Plot:
+    """A figure by `draw(figure, narrow)`, so many inches high where it is 10 wide, and where it is a narrow 4.6.
 
     Raises: InputError when matplotlib is not installed (extra `report`).
     """
-    heights = {"wide": height_in, "narrow": narrow_height_in or 0.75 * height_in}
-    return Plot(name, caption, *(_svg(name, caption, draw, layout, heights[layout]) for layout in ("wide", "narrow")))
+    wide, narrow = (_svg(name, caption, draw, *pair) for pair in zip(_WIDTH_IN, heights_in, strict=True))
+    return Plot(name, caption, wide, narrow)
 
 
 def _svg(name: str, caption: str, draw: Draw, layout: str, height_in: float) -> str:

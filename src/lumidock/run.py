@@ -9,27 +9,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from lumidock.config import Config
-from lumidock.datatypes import Detections, Fix, Frame, Stage, Unusable
+from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import FrameError, InputError
+from lumidock.methods import TwoDoors
 from lumidock.streams.runfolder import RunFolder, identities
 from lumidock.streams.sources import Item, Source
-
-
-class TwoDoors(Protocol):
-    """What every method offers: an image door and a light door."""
-
-    def process(self, frame: Frame) -> Fix:
-        """Fix of one picture. Raises: FrameError for one that does not fit the calibration."""
-        ...
-
-    def process_detections(self, detections: Detections) -> Fix:
-        """Fix of one frame's detections."""
-        ...
 
 
 @dataclass(slots=True)

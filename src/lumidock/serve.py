@@ -18,7 +18,8 @@ import numpy as np
 
 from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import LumidockError
-from lumidock.run import TwoDoors, process
+from lumidock.methods import TwoDoors
+from lumidock.run import process
 from lumidock.sinks import Sink
 from lumidock.streams.sources import Item
 

@@ -33,13 +33,13 @@ from lumidock.cli.shared import (
     SourceArgument,
     StationOption,
     Topic,
+    Workers,
     app,
     calibration_of,
     copy,
     example,
     file_of,
     interrupts_held,
-    localizer_of,
     open_any,
     prepare_folder,
     prepare_sequence,
@@ -50,12 +50,11 @@ from lumidock.cli.shared import (
 from lumidock.config import Config, load_config
 from lumidock.datatypes import Fix
 from lumidock.errors import InputError, LumidockError
+from lumidock.methods import METHODS, localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.sources import Item, open_source
 
 _MAX_SEED = 10**9
-
-
 _COMMANDS = (
     evaluation,
     inspection,
@@ -162,7 +161,7 @@ def _run(
     settings = load_config(config) if config else Config()
     dock = load_station(station_file)
     lens = calibration_of(camera, opened)
-    localizer = localizer_of(method, dock, lens, settings, cold)
+    localizer = localizer_of(method, dock, lens, settings, cold=cold)
     if out.is_dir() and opened.path.is_dir() and out.samefile(opened.path):
         raise InputError(f"{out}: is the source; write the run elsewhere")
     prepare_folder(out, force)
@@ -212,9 +211,7 @@ def _sim(
         typer.Option("--detections", help="Bare detections, without rendering: path, faults and spots alone count."),
     ] = False,
     video: Annotated[bool, typer.Option("--video", help="Pictures as video.mp4 instead of frames/.")] = False,
-    workers: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Processes; without it one for each core.")
-    ] = None,
+    workers: Workers = None,
     station: StationOption = None,
     camera: CameraOption = None,
     force: Force = False,
@@ -253,9 +250,7 @@ def _campaign(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY.SUBKEY=VALUE", help="Of all scenarios; may be repeated.")
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Processes; without it one for each core.")
-    ] = None,
+    workers: Workers = None,
     cluster: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Run on the dask cluster there: tcp://HOST:PORT.")
     ] = None,
@@ -268,13 +263,12 @@ def _campaign(
     as_json: AsJson = False,
 ) -> None:
     """Run scenarios x seeds x methods on bare detections, and count."""
-    from lumidock.campaign import METHODS, plan, prepare, run_campaign, tabulate
+    from lumidock.campaign import plan, prepare, run_campaign, tabulate
     from lumidock.campaign_table import markdown
     from lumidock.sim.scenario import load_scenario
 
     for method in methods or ():
-        if method not in METHODS:
-            raise InputError(f"--method {method}: no such method; there are {' and '.join(METHODS)}")
+        require_method(method)
     campaign = plan(
         [load_scenario(name, tuple(settings or ())) for name in scenarios],
         methods or METHODS[:1],

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from lumidock.camera import Camera, load_camera
-from lumidock.cli.shared import AsJson, Force, app, example, open_any, shipped_or_path
+from lumidock.cli.shared import AsJson, Force, app, example, open_any, require_new, shipped_or_path
 from lumidock.datatypes import Frame
 from lumidock.errors import InputError
 
@@ -33,7 +33,7 @@ def _import(
     from lumidock.calib import read_calibration, write_calibration
 
     camera = read_calibration(source, name=name, size=_size(size))
-    _write_new(target, force)
+    require_new(target, force)
     write_calibration(camera, target, "ros")
     print(f"{camera.width} x {camera.height}, {camera.model}, written to {target}")
 
@@ -49,7 +49,7 @@ def _export(
     from lumidock.calib import write_calibration
 
     camera = load_camera(shipped_or_path("camera", source))
-    _write_new(target, force)
+    require_new(target, force)
     write_calibration(camera, target, form)
     print(f"written to {target}")
 
@@ -111,8 +111,3 @@ def _require_size_of(frames: str, camera: Camera, source: str) -> None:
                 raise InputError(f"{source}: {text}")
             return
     raise InputError(f"{frames}: no frame that can be read")
-
-
-def _write_new(path: Path, force: bool) -> None:
-    if path.exists() and not force:
-        raise InputError(f"{path}: exists; give --force to replace it")

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lumidock.cli.shared import AsJson, Force, app, example
-from lumidock.errors import InputError
+from lumidock.cli.shared import AsJson, Force, app, example, require_new
 
 
 @app.command(
@@ -34,8 +33,8 @@ def _eval(
     from lumidock.metrics import evaluate
     from lumidock.runs import evaluate_all, write_table
 
-    if out is not None and out.exists() and not force:
-        raise InputError(f"{out}: exists; give --force to replace it")
+    if out is not None:
+        require_new(out, force)
     one = (run / "fixes.csv").exists()
     if one and truth is not None and out is None:  # needs no run.json
         result = evaluate(run, truth)

@@ -7,8 +7,17 @@ from typing import Annotated
 
 import typer
 
-from lumidock.cli.shared import Force, Topic, VehicleOption, app, example, interrupts_held, progress_bar
-from lumidock.errors import InputError
+from lumidock.cli.shared import (
+    Force,
+    Fps,
+    Topic,
+    VehicleOption,
+    app,
+    example,
+    interrupts_held,
+    progress_bar,
+    require_new,
+)
 from lumidock.streams.sources import open_source
 from lumidock.vehicle import load_vehicle
 
@@ -30,14 +39,13 @@ def _export(
     ] = None,
     vehicle: VehicleOption = None,
     topic: Topic = None,
-    fps: Annotated[float | None, typer.Option("--fps", metavar="F", help="As for the run.")] = None,
+    fps: Fps = None,
     force: Force = False,
 ) -> None:
     """Turn RUN into a file for ROS 2, Rerun, video players or tables."""
     from lumidock.export import export
 
-    if target.exists() and not force:
-        raise InputError(f"{target}: exists; give --force to replace it")
+    require_new(target, force)
     opened = open_source(source, fps, topic=topic) if source else None
     mounting = load_vehicle(vehicle) if vehicle else None
     with interrupts_held() as let_interrupt, progress_bar("export") as progress:

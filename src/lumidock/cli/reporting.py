@@ -15,12 +15,13 @@ from lumidock.cli.shared import (
     CameraOption,
     Force,
     StationOption,
+    Workers,
     app,
     example,
     progress_bar,
+    require_new,
     shipped_or_path,
 )
-from lumidock.errors import InputError
 
 
 @app.command(
@@ -49,8 +50,7 @@ def _report(
     from lumidock import page
     from lumidock.report import report
 
-    if out.exists() and not force:
-        raise InputError(f"{out}: exists; give --force to replace it")
+    require_new(out, force)
     with progress_bar("report") as progress:
         text = report(runs, sources or (), progress=progress)
     page.write(out, text)
@@ -69,9 +69,7 @@ def _reproduce(
         Path, typer.Option("--out", metavar="DIR", help="Folder to write; the same command goes on where it was.")
     ],
     full: Annotated[bool, typer.Option("--full/--quick", help="Hours, or minutes (default).")] = False,
-    workers: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Processes; without it one for each core.")
-    ] = None,
+    workers: Workers = None,
     station: StationOption = None,
     camera: CameraOption = None,
     force: Force = False,

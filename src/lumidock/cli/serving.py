@@ -32,16 +32,18 @@ from lumidock.cli.shared import (
     copy,
     example,
     file_of,
-    localizer_of,
     open_any,
     prepare_folder,
+    require_new,
     simulated,
 )
 from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
+from lumidock.methods import localizer_of
 from lumidock.serve import STALE_S, Camera, Newest, Server, Worker
 from lumidock.sinks import FILE_KINDS, Numbered, RunSink, Scene, open_rerun
 from lumidock.station import load_station
+from lumidock.streams.healthpage import HealthPage
 from lumidock.vehicle import load_vehicle
 from lumidock.warm import warm_up
 
@@ -113,8 +115,6 @@ def _serve(
     force: Force = False,
 ) -> None:
     """Localize live and tell the vehicle, until stopped."""
-    from lumidock.streams.healthpage import HealthPage
-
     with ExitStack() as stack:
         if source.startswith(SIM):
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -125,8 +125,8 @@ def _serve(
         lens = calibration_of(camera, opened)
         scene = Scene(dock, lens, load_vehicle(vehicle) if vehicle else None)
         settings = load_config(config) if config else Config()
-        list(warm_up(localizer_of(method, dock, lens, settings, cold=False).process, dock, lens))
-        localizer = localizer_of(method, dock, lens, settings, cold=False)
+        list(warm_up(localizer_of(method, dock, lens, settings).process, dock, lens))
+        localizer = localizer_of(method, dock, lens, settings)
         sinks = [
             *_vehicle_sinks(scene, mavlink, zenoh, domain if dds else None, domain, host),
             *_viewer_sinks(scene, foxglove_port if foxglove else None, rerun, host),
@@ -136,7 +136,7 @@ def _serve(
         stop, newest = threading.Event(), Newest()
         reader = Camera(opened.items, newest, live=opened.live, loop=loop, stop=stop)
         server = Server(localizer, reader, newest, sinks, stop)
-        page = HealthPage(host, health_port, server.health)
+        page = _health_page(host, health_port, server)
         stack.callback(page.close)
         print(f"health at http://{host}:{page.port}/", flush=True)
         with _stopped_by_signals(stop):
@@ -145,6 +145,14 @@ def _serve(
     print(f"{counts['frames']} frames: {counts['valid']} valid; {newest.dropped} came too fast and were dropped")
     if reader.problem and not opened.live:
         raise InputError(reader.problem)
+
+
+def _health_page(host: str, port: int, server: Server) -> HealthPage:
+    """The page, listening. Raises: InputError where that cannot be."""
+    try:
+        return HealthPage(host, port, server.health)
+    except OSError as error:
+        raise InputError(f"--health-port {port}: cannot listen on {host}: {error.strerror or error}") from None
 
 
 @contextmanager
@@ -211,8 +219,7 @@ def _file_sinks(scene: Scene, station_file: Path, out: Path | None, record: list
     for path in record:
         if path.suffix not in FILE_KINDS:
             raise InputError(f"--record {path}: not one of {', '.join(FILE_KINDS)}")
-        if path.exists() and not force:
-            raise InputError(f"{path}: exists; give --force to replace it")
+        require_new(path, force)
         workers.append(Worker(path.name, Numbered(path, scene).open, queue=_LONG, patient=True))
     return workers
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -23,14 +23,10 @@ from rich.progress import (
 )
 
 from lumidock.camera import Camera, load_camera
-from lumidock.config import Config
 from lumidock.errors import InputError
-from lumidock.station import Station, load_station
+from lumidock.station import load_station
 from lumidock.streams.live import open_live
 from lumidock.streams.sources import Source, open_source
-
-if TYPE_CHECKING:
-    from lumidock.run import TwoDoors
 
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -82,6 +78,7 @@ Bits = Annotated[
 Fps = Annotated[
     float | None, typer.Option("--fps", metavar="F", help="Frames per second, for sources without time stamps.")
 ]
+Workers = Annotated[int | None, typer.Option("--workers", metavar="N", min=1, help="Processes; by default one a core.")]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from it.")]
 
 
@@ -110,6 +107,12 @@ def copy(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
+def require_new(file: Path, force: bool) -> None:
+    """Raises: InputError for a file that exists, unless `force`."""
+    if file.exists() and not force:
+        raise InputError(f"{file}: exists; give --force to replace it")
+
+
 def prepare_folder(folder: Path, force: bool) -> None:
     """Make an output folder; an existing one only with `force`."""
     if folder.exists() and not folder.is_dir():
@@ -133,19 +136,6 @@ def prepare_sequence(folder: Path, force: bool) -> None:
         else:
             stale.unlink(missing_ok=True)
     truth.write_bytes(b"")  # marks the folder as simulated, also when the simulation is cut short
-
-
-def localizer_of(method: str, station: Station, camera: Camera, config: Config, cold: bool) -> TwoDoors:
-    """The method of that name. Raises: InputError for one that there is not, or a station that it cannot tell apart."""
-    if method == "lumidock":
-        from lumidock.localizer import Localizer
-
-        return Localizer(station, camera, config, cold=cold)
-    if method == "paper":
-        from lumidock.paper import PaperLocalizer
-
-        return PaperLocalizer(station, camera, config.paper, cold=cold)
-    raise InputError(f"--method {method}: no such method; there are lumidock and paper")
 
 
 def open_any(

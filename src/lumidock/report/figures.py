@@ -11,16 +11,16 @@ import numpy as np
 from lumidock.datatypes import Array
 from lumidock.page import Plot
 from lumidock.plots import COLORS, plot
-from lumidock.report.view import KINDS, RunView
+from lumidock.report.view import KINDS, STAGES, RunView
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STAGES = ("search", "front", "transition", "rear")
 _MOST_POINTS = 700  # of a series; of longer runs every k-th frame is drawn, and all that is over its level
 _ELLIPSES = 14
 _SHOWN = {"lateral": ("lateral, m", 1.0), "axial": ("axial, m", 1.0), "angle": ("angle, deg", 180.0 / np.pi)}
+_LAYER_COLORS = ("front", "rear", "transition", "accent")
 _RUN_COLORS = ("rear", "front", "transition", "accent", "bad", "search")
 
 
@@ -58,19 +58,12 @@ def trajectory(view: RunView, prefix: str, most_points: int = _MOST_POINTS) -> P
     truth = " The thin line is the truth." if view.has_truth else ""
     caption = (
         "Where the camera was in the dock frame: from above (x to the right) and from the side (y up), over the "
-        "distance z "
-        "before the entrance plane, all in metres; the vehicle comes from the left. Points are valid poses, "
-        "coloured by "
-        "docking stage; ellipses 2 sigma; the band is the lateral protection level, dotted lines the alert "
-        f"limit.{truth} "
-        "Stars are lights."
+        "distance z before the entrance plane, all in metres; the vehicle comes from the left. Points are valid poses, "
+        "coloured by docking stage; ellipses 2 sigma; the band is the lateral protection level, dotted lines the alert "
+        f"limit.{truth} Stars are lights."
     )
     return plot(
-        f"{prefix}-trajectory",
-        caption,
-        lambda f, narrow: _draw_trajectory(f, narrow, view, most_points),
-        height_in=6.0,
-        narrow_height_in=6.4,
+        f"{prefix}-trajectory", caption, lambda f, narrow: _draw_trajectory(f, narrow, view, most_points), (6.0, 6.4)
     )
 
 
@@ -163,17 +156,10 @@ def levels(view: RunView, prefix: str) -> Plot:
     """Protection levels, alert limits and, where there is a truth, errors over time."""
     error = "Points are errors against the truth, coloured by stage; the" if view.has_truth else "The"
     caption = (
-        f"What the poses promise, over time in seconds. {error} line is the protection level, which the error "
-        "passes once "
-        "in a million frames; dotted: the alert limit, over which a pose is not valid. Logarithmic."
+        f"What the poses promise, over time in seconds. {error} line is the protection level, which the error passes "
+        "once in a million frames; dotted: the alert limit, over which a pose is not valid. Logarithmic."
     )
-    return plot(
-        f"{prefix}-levels",
-        caption,
-        lambda f, narrow: _draw_levels(f, narrow, view),
-        height_in=6.2,
-        narrow_height_in=7.0,
-    )
+    return plot(f"{prefix}-levels", caption, lambda f, narrow: _draw_levels(f, narrow, view), (6.2, 7.0))
 
 
 def _draw_levels(figure: Figure, narrow: bool, view: RunView) -> None:
@@ -199,15 +185,11 @@ def guide(view: RunView, prefix: str) -> Plot:
     """The same of bearing and range, and the range itself."""
     error = "Points are errors against the truth; the" if view.has_truth else "The"
     caption = (
-        "Bearing and range of the dock, over time in seconds: range in metres as the guide says it, then its "
-        "bearing and its "
-        f"range error. {error} line is the protection level, dotted the alert limit; both end 3 m before the "
-        "dock, where a "
-        "guide is a valid pose."
+        "Bearing and range of the dock, over time in seconds: range in metres as the guide says it, then its bearing "
+        f"and its range error. {error} line is the protection level, dotted the alert limit; both end 3 m before the "
+        "dock, where a guide is a valid pose."
     )
-    return plot(
-        f"{prefix}-guide", caption, lambda f, _narrow: _draw_guide(f, view), height_in=5.6, narrow_height_in=6.6
-    )
+    return plot(f"{prefix}-guide", caption, lambda f, _narrow: _draw_guide(f, view), (5.6, 6.6))
 
 
 def _draw_guide(figure: Figure, view: RunView) -> None:
@@ -226,19 +208,11 @@ def _draw_guide(figure: Figure, view: RunView) -> None:
 def stanford(view: RunView, prefix: str) -> Plot:
     """Error against protection level, both as shares of the alert limit."""
     caption = (
-        "Stanford diagram: each valid pose by its error and its protection level, both divided by its alert "
-        "limit. Above the "
-        "diagonal the pose kept its promise; below it the error was over its level (misleading); in the shaded "
-        "corner it was "
-        "over the alert limit as well (hazardous), where nothing may ever be."
+        "Stanford diagram: each valid pose by its error and its protection level, both divided by its alert limit. "
+        "Above the diagonal the pose kept its promise; below it the error was over its level (misleading); in the "
+        "shaded corner it was over the alert limit as well (hazardous), where nothing may ever be."
     )
-    return plot(
-        f"{prefix}-stanford",
-        caption,
-        lambda f, narrow: _draw_stanford(f, narrow, view),
-        height_in=3.9,
-        narrow_height_in=9.6,
-    )
+    return plot(f"{prefix}-stanford", caption, lambda f, narrow: _draw_stanford(f, narrow, view), (3.9, 9.6))
 
 
 def _draw_stanford(figure: Figure, narrow: bool, view: RunView) -> None:
@@ -264,32 +238,22 @@ def lights(view: RunView, prefix: str) -> Plot:
     """A row for each light: when it was named."""
     truth = " Grey: it could be seen, by the truth." if view.visible is not None else ""
     caption = (
-        f"When each light was named, over time in seconds; a row a light, coloured by layer.{truth} Below: the "
-        "number of "
-        "detections that were taken for no light."
+        f"When each light was named, over time in seconds; a row a light, coloured by layer.{truth} Below: the number "
+        "of detections that were taken for no light."
     )
-    height = 1.2 + 0.19 * len(view.station.ids)
+    rows = len(view.station.ids)
     return plot(
-        f"{prefix}-lights",
-        caption,
-        lambda f, _narrow: _draw_lights(f, view),
-        height_in=height,
-        narrow_height_in=1.4 + 0.21 * len(view.station.ids),
+        f"{prefix}-lights", caption, lambda f, _narrow: _draw_lights(f, view), (1.2 + 0.19 * rows, 1.4 + 0.21 * rows)
     )
 
 
 def _draw_lights(figure: Figure, view: RunView) -> None:
-    ids, (axes, below) = (
-        view.station.ids,
-        figure.subplots(2, 1, sharex=True, height_ratios=[len(view.station.ids), 2.6]),
-    )
-    layers = view.station.layers_front_to_rear()
+    ids, layers = view.station.ids, view.station.layers_front_to_rear()
+    axes, below = figure.subplots(2, 1, sharex=True, height_ratios=[len(ids), 2.6])
     order = [int(light) for layer in layers for light in view.station.lights_of(layer)]
     for row, light in enumerate(order):
         named = np.array([fix.match is not None and bool((fix.match.light == light).any()) for fix in view.fixes])
-        color = ("front", "rear", "transition", "accent")[
-            layers.index(view.station.layers[view.station.layer[light]]) % 4
-        ]
+        color = _LAYER_COLORS[layers.index(view.station.layers[view.station.layer[light]]) % len(_LAYER_COLORS)]
         if view.visible is not None:
             axes.broken_barh(_spans(view, view.visible[:, light]), (row - 0.42, 0.84), color=COLORS["line"], lw=0)
         axes.broken_barh(_spans(view, named), (row - 0.28, 0.56), color=COLORS[color], lw=0)
@@ -322,19 +286,12 @@ def _spans(view: RunView, which: np.ndarray) -> list[tuple[float, float]]:
 def states(view: RunView, prefix: str) -> Plot:
     """Stages and hand-over, what could be used, and why there was no pose."""
     caption = (
-        "Stages and hand-over, over time in seconds: the docking stage, frames with a valid pose, frames with "
-        "bearing and "
-        "range (guide), and, a row for each, the reasons why there was no valid pose."
+        "Stages and hand-over, over time in seconds: the docking stage, frames with a valid pose, frames with bearing "
+        "and range (guide), and, a row for each, the reasons why there was no valid pose."
     )
     reasons = sorted({fix.reason for fix in view.fixes if fix.reason})
     height = 1.3 + 0.24 * (3 + len(reasons))
-    return plot(
-        f"{prefix}-states",
-        caption,
-        lambda f, _narrow: _draw_states(f, view, reasons),
-        height_in=height,
-        narrow_height_in=height,
-    )
+    return plot(f"{prefix}-states", caption, lambda f, _narrow: _draw_states(f, view, reasons), (height, height))
 
 
 def _draw_states(figure: Figure, view: RunView, reasons: Sequence[str]) -> None:
@@ -357,9 +314,7 @@ def _draw_states(figure: Figure, view: RunView, reasons: Sequence[str]) -> None:
 def latency(views: Sequence[RunView], prefix: str) -> Plot:
     """How long frames took."""
     caption = "Time that a frame took in milliseconds, decoding excluded; logarithmic. Dashed: the 95th percentile."
-    return plot(
-        f"{prefix}-latency", caption, lambda f, _narrow: _draw_latency(f, views), height_in=2.8, narrow_height_in=2.9
-    )
+    return plot(f"{prefix}-latency", caption, lambda f, _narrow: _draw_latency(f, views), (2.8, 2.9))
 
 
 def _draw_latency(figure: Figure, views: Sequence[RunView]) -> None:
@@ -388,26 +343,13 @@ def comparison(views: Sequence[RunView], prefix: str) -> list[Plot]:
     figures = []
     if any(np.isfinite(view.errors).any() for view in views):
         caption = (
-            "Errors of the valid poses over the true distance z before the entrance plane in metres; "
-            "logarithmic. A colour a "
-            "run."
+            "Errors of the valid poses over the true distance z before the entrance plane in metres; logarithmic. A "
+            "colour a run."
         )
-        figures.append(
-            plot(
-                f"{prefix}-errors",
-                caption,
-                lambda f, narrow: _draw_errors(f, narrow, views),
-                height_in=6.2,
-                narrow_height_in=7.0,
-            )
-        )
+        figures.append(plot(f"{prefix}-errors", caption, lambda f, narrow: _draw_errors(f, narrow, views), (6.2, 7.0)))
     caption = "When each run had a valid pose (thick) and bearing and range (thin), over time in seconds; a row a run."
     height = 1.0 + 0.42 * len(views)
-    figures.append(
-        plot(
-            f"{prefix}-use", caption, lambda f, _narrow: _draw_use(f, views), height_in=height, narrow_height_in=height
-        )
-    )
+    figures.append(plot(f"{prefix}-use", caption, lambda f, _narrow: _draw_use(f, views), (height, height)))
     timed = [view for view in views if np.isfinite(view.latency_ms).any()]
     return [*figures, latency(timed, prefix)] if timed else figures
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from lumidock.datatypes import Array, Fix, Image
-from lumidock.errors import LumidockError
+from lumidock.errors import extra
 from lumidock.station import Station
 
 if TYPE_CHECKING:
@@ -22,13 +22,11 @@ _STAGE_COLORS = {"search": "#7f7f7f", "front": "#d9860a", "transition": "#2a9d5c
 def plot_trajectory(fixes: Sequence[Fix], truth: dict[str, Array], station: Station, out: Path) -> None:
     """Top view, side view and errors of a run against the true poses `T_dock_cam` by frame name; writes a PNG.
 
-    Raises: LumidockError when matplotlib is not installed (extra `report`).
+    Raises: InputError when matplotlib is not installed (extra `report`).
     """
-    try:
+    with extra("report"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    except ModuleNotFoundError:
-        raise LumidockError("plots need matplotlib: pip install 'lumidock[report]'") from None
     figure = Figure(figsize=(11, 8.5), layout="constrained")
     FigureCanvasAgg(figure)
     top, side, error = figure.subplots(3, 1, sharex=True, height_ratios=[1, 1, 1.1])

@@ -14,11 +14,12 @@ import yaml
 
 from lumidock.config import Config
 from lumidock.page import Listing, Table, Tile
-from lumidock.report.view import RunView
+from lumidock.report.view import STAGES, RunView
 
 _WHY = {
     "no_lights": "no spot in the picture that could be a lamp",
     "too_few": "too few lights for a pose",
+    "too_many": "more spots than the method looks at",
     "ambiguous": "more than one naming of the spots fits about as well",
     "mirror": "the mirror image of the dock fits about as well",
     "inconsistent": "the spots fit no arrangement of the dock's lights",
@@ -86,7 +87,7 @@ def _longest(view: RunView, word: str) -> str:
 def handover(view: RunView) -> Table | None:
     """Where each stage began and ended."""
     rows = []
-    for stage in ("search", "front", "transition", "rear"):
+    for stage in STAGES:
         at = [k for k, fix in enumerate(view.fixes) if fix.stage == stage]
         posed = [k for k in at if view.valid[k]]
         if at:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from lumidock import runs, trust
 from lumidock.camera import Camera, load_camera
-from lumidock.datatypes import Array, Fix
+from lumidock.datatypes import Array, Fix, Stage
 from lumidock.errors import InputError
 from lumidock.metrics import evaluate, read_rows, true_poses
 from lumidock.station import Station, load_station
@@ -19,6 +19,7 @@ from lumidock.streams.sources import Source
 from lumidock.trust import GuideClaims, PoseClaims
 
 KINDS = ("lateral", "axial", "angle")
+STAGES: tuple[Stage, ...] = get_args(Stage)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,10 +19,10 @@ def swarm(result: dict[str, Any]) -> Plot:
     """Figure 6: the best particle over the iterations."""
     caption = (
         f"The swarm converging (the paper's figure 6) on {result['spots']} of the front lights from z = "
-        f"{result['z_m']:.1f} m: "
-        "roll in degrees, scale and shift of the best particle, and how many names are right, over its iterations."
+        f"{result['z_m']:.1f} m: roll in degrees, scale and shift of the best particle, and how many names are right, "
+        "over its iterations."
     )
-    return plot("swarm", caption, lambda f, narrow: _draw_swarm(f, narrow, result), height_in=4.2, narrow_height_in=7.5)
+    return plot("swarm", caption, lambda f, narrow: _draw_swarm(f, narrow, result), (4.2, 7.5))
 
 
 def _draw_swarm(figure: Figure, narrow: bool, result: dict[str, Any]) -> None:
@@ -47,17 +47,11 @@ def _draw_swarm(figure: Figure, narrow: bool, result: dict[str, Any]) -> None:
 def backtracking(result: dict[str, Any]) -> Plot:
     """Figure 7: one light missing and one spurious spot, as the swarm and as the filter name them."""
     caption = (
-        "The backtracking filter at work (figure 7), pixels: one front light is dark and one spot is spurious "
-        "(red). Crosses: "
-        "where the filter expects the lights. Left the names that the swarm alone gives, right those of the filter."
+        "The backtracking filter at work (figure 7), pixels: one front light is dark and one spot is spurious (red). "
+        "Crosses: where the filter expects the lights. Left the names that the swarm alone gives, right those of the "
+        "filter."
     )
-    return plot(
-        "backtracking",
-        caption,
-        lambda f, narrow: _draw_backtracking(f, narrow, result),
-        height_in=2.9,
-        narrow_height_in=5.0,
-    )
+    return plot("backtracking", caption, lambda f, narrow: _draw_backtracking(f, narrow, result), (2.9, 5.0))
 
 
 def _draw_backtracking(figure: Figure, narrow: bool, result: dict[str, Any]) -> None:
@@ -78,13 +72,10 @@ def _draw_backtracking(figure: Figure, narrow: bool, result: dict[str, Any]) -> 
 def search(views: Sequence[RunView]) -> Plot:
     """Figure 13: path and estimates in the plane of the search."""
     caption = (
-        "The search (figure 13): the path (line) and the estimates (points) in the plane at 15 m, x to the "
-        "right and y up, "
-        "metres; first lumidock, where bearing and range alone place no point, then the paper's method."
+        "The search (figure 13): the path (line) and the estimates (points) in the plane at 15 m, x to the right and y "
+        "up, metres; first lumidock, where bearing and range alone place no point, then the paper's method."
     )
-    return plot(
-        "search", caption, lambda f, narrow: _draw_search(f, narrow, views), height_in=4.6, narrow_height_in=7.6
-    )
+    return plot("search", caption, lambda f, narrow: _draw_search(f, narrow, views), (4.6, 7.6))
 
 
 def _draw_search(figure: Figure, narrow: bool, views: Sequence[RunView]) -> None:
@@ -101,7 +92,7 @@ def envelope(rows: Sequence[Sequence[str]], caption: str) -> Plot:
     """A bar for each water and method from the first to the last use."""
     height = 1.2 + 0.34 * len(rows)
     bars = f"{caption} Bars, from the top: the paper's pose (amber), our pose (green), our bearing and range (blue)."
-    return plot("envelope", bars, lambda f, _narrow: _draw_envelope(f, rows), height_in=height, narrow_height_in=height)
+    return plot("envelope", bars, lambda f, _narrow: _draw_envelope(f, rows), (height, height))
 
 
 def _draw_envelope(figure: Figure, rows: Sequence[Sequence[str]]) -> None:

@@ -53,16 +53,13 @@ def sections_of(grid: Grid, results: Results, out: Path) -> list[Section]:
 
 
 _TABLE_1_TEXT = (
-    "The paper's section 4.1 at point level: 0.5 px of noise, runs toward the dock at 1.5 m/s and 4 Hz; a frame "
-    "counts when "
-    "all seven front lights are in view, and is right when every true detection carries its own name and no "
-    "spurious one "
-    "carries any. The swarm and our cold figures have no history; the other two have."
+    "The paper's section 4.1 at point level: 0.5 px of noise, runs toward the dock at 1.5 m/s and 4 Hz; a frame counts "
+    "when all seven front lights are in view, and is right when every true detection carries its own name and no "
+    "spurious one carries any. The swarm and our cold figures have no history; the other two have."
 )
 _FILTER_TEXT = (
-    "The swarm converging on the registration; and a spurious light that appears and then stays while a true "
-    "one goes dark, "
-    "where one-to-one assignment has to name the spurious one and the backtracking filter does not."
+    "The swarm converging on the registration; and a spurious light that appears and then stays while a true one goes "
+    "dark, where one-to-one assignment has to name the spurious one and the backtracking filter does not."
 )
 _SEARCH_TEXT = (
     "Once round a rectangle at 15 m, so that the dock is seen from below, left, above and right, and in part."
@@ -71,14 +68,14 @@ _DOCKING_TEXT = (
     "30 m to the docking plane at z = -3 m in rendered Jerlov III water at 2 ms; both methods on the same pictures."
 )
 _COLD_TEXT = (
-    "Independent frames without history. The paper says that missing and spurious lights together defeat its "
-    "method before "
-    "its first fix; answers are frames with names, right ones have every name right, wrong ones at least one wrong."
+    "Independent frames without history. The paper says that missing and spurious lights together defeat its method "
+    "before its first fix; answers are frames with names, right ones have every name right, wrong ones at least one "
+    "wrong."
 )
 _ENVELOPE_TEXT = (
-    "Approaches rendered for each water and exposure: true z of the first and the last frame that could be "
-    "used. Our method "
-    "by bearing and range (guide) and by full pose (valid); the paper's by its pose, which it does not vouch for."
+    "Approaches rendered for each water and exposure: true z of the first and the last frame that could be used. Our "
+    "method by bearing and range (guide) and by full pose (valid); the paper's by its pose, which it does not vouch "
+    "for."
 )
 _HAZARD_TEXT = (
     "Every shipped docking: frames that claim to be usable while their error is over the alert limit. Point level: "
@@ -94,8 +91,8 @@ _HAZARD_TEXT = (
 def _summary_table(results: Results) -> tuple[Table, list[_Claim]]:
     rows = [*_table_1_claims(results), *_docking_claims(results)]
     table = Table(
-        "The paper's own figures and those found here; ✓: as good or better. Times are of this machine, "
-        "the paper's of a Jetson.",
+        "The paper's own figures and those found here; ✓: as good or better. Times are of this machine, the paper's "
+        "of a Jetson.",
         ["figure", "paper", "its method here", "lumidock"],
         [[name, paper, _with_verdict(theirs), _with_verdict(ours)] for name, paper, theirs, ours in rows],
     )

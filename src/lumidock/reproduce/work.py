@@ -18,12 +18,13 @@ from lumidock.config import Config, PaperConfig
 from lumidock.datatypes import Array, Fix, Frame, Unusable
 from lumidock.errors import FrameError
 from lumidock.localizer import Localizer
+from lumidock.methods import METHODS, TwoDoors, localizer_of
 from lumidock.metrics import evaluate, true_poses
 from lumidock.paper import PaperLocalizer, btekf
 from lumidock.paper.layer import LayerLocalizer
 from lumidock.pose import project_lights
 from lumidock.reproduce.trials import Counts, trial, trials_scenario, verdict
-from lumidock.run import Setup, TwoDoors, run
+from lumidock.run import Setup, run
 from lumidock.sim.scenario import Scenario, load_scenario, spurious_paths, trajectory
 from lumidock.sim.sequence import file_of, render_frame, rendered
 from lumidock.sim.spots import SpotFrame, spot_frames
@@ -35,7 +36,6 @@ from lumidock.streams.runfolder import RunFolder
 from lumidock.streams.sources import Source
 from lumidock.tally import Tally
 
-METHODS = ("lumidock", "paper")
 _FOUR = 4  # named lights of a layer that give a pose by it alone
 Dock = tuple[str, str]  # station and camera file
 Pictures = list[tuple[Row, bytes]]  # a sequence in memory, as `rendered` gives it
@@ -43,12 +43,6 @@ Pictures = list[tuple[Row, bytes]]  # a sequence in memory, as `rendered` gives 
 
 def _load(dock: Dock) -> tuple[Station, Camera]:
     return load_station(Path(dock[0])), load_camera(Path(dock[1]))
-
-
-def _localizer(method: str, station: Station, camera: Camera, *, cold: bool = False) -> TwoDoors:
-    if method == "paper":
-        return PaperLocalizer(station, camera, cold=cold)
-    return Localizer(station, camera, cold=cold)
 
 
 # At point level
@@ -68,7 +62,7 @@ def cold_start(dock: Dock, scenario: str, settings: list[str], seed: int) -> dic
     frames = list(spot_frames(loaded, station, camera, seed))
     result: dict[str, Any] = {"frames": len(frames)}
     for method in METHODS:
-        localizer = _localizer(method, station, camera, cold=True)
+        localizer = localizer_of(method, station, camera, Config(), cold=True)
         fixes = [localizer.process_detections(frame.detections) for frame in frames]
         verdicts = np.array([verdict(fix, frame) for fix, frame in zip(fixes, frames, strict=True)]).reshape(-1, 2)
         answered = sum(fix.status != "none" for fix in fixes)
@@ -109,11 +103,11 @@ def _run_method(dock: Dock, method: str, sequence: Path, pictures: Pictures, out
     files = Path(dock[0]), sequence / "camera.yaml"
     setup, inputs = Setup(method, False, Config(), *files), (sequence / "timestamps.csv",)
     source = Source(sequence, "sequence", lambda: _items(pictures), len(pictures), inputs=inputs)
-    _warm(_localizer(method, station, camera), pictures)
+    _warm(localizer_of(method, station, camera, Config()), pictures)
     with RunFolder(out, station.ids) as run_folder:
         for file, name in zip(files, ("station.yaml", "camera.yaml"), strict=True):
             shutil.copyfile(file, out / name)
-        run(source, _localizer(method, station, load_camera(files[1])), run_folder, setup)
+        run(source, localizer_of(method, station, load_camera(files[1]), Config()), run_folder, setup)
     return evaluate(out, sequence) | reach(out, sequence)
 
 
@@ -176,7 +170,7 @@ def envelope(dock: Dock, settings: list[str], seed: int) -> dict[str, Any]:
     """First and last use of each method on an approach that is rendered in memory, every frame by both."""
     station, camera = _load(dock)
     scenario = load_scenario("approach", tuple(settings))
-    localizers = {method: _localizer(method, station, camera) for method in METHODS}
+    localizers = {method: localizer_of(method, station, camera, Config()) for method in METHODS}
     seen: dict[str, list[tuple[float, bool, bool]]] = {method: [] for method in METHODS}
     for z, frame in _rendered(scenario, station, camera, seed):
         for method, localizer in localizers.items():

@@ -10,7 +10,7 @@ from lumidock.datatypes import Array
 from lumidock.geometry import se3_inverse, transform_points
 from lumidock.sim.lens import Lens
 from lumidock.sim.scenario import Scenario
-from lumidock.sim.spots import shown_layers
+from lumidock.sim.spots import emission_cosine, shown_layers
 from lumidock.sim.water import BAND_NM
 from lumidock.station import Station
 
@@ -107,12 +107,6 @@ def emitters(
         np.broadcast_to(np.asarray(halo, float), len(p_cam)),
         lit,
     )
-
-
-def emission_cosine(p_dock: Array, axis: Array, t_dock_cam: Array) -> Array:
-    """Cosine (M,) of the angle between each lamp's axis and the direction to the camera."""
-    to_camera = t_dock_cam - p_dock
-    return np.asarray((to_camera * axis).sum(axis=1) / np.linalg.norm(to_camera, axis=1))
 
 
 def lamp_watts(scenario: Scenario, station: Station, transmission: Array, duty: float) -> Array:

@@ -88,13 +88,13 @@ class World:
 def in_view(station: Station, camera: Camera, T_dock_cam: Array) -> tuple[Array, np.ndarray]:
     """Pixels (M, 2) of all lights and which of them (M,) lie in the picture and shine toward the camera."""
     uv = project_lights(camera, T_dock_cam, station.p_dock)
-    return uv, camera.contains(uv) & (emission_cosine(station, T_dock_cam) > 0.0)
+    return uv, camera.contains(uv) & (emission_cosine(station.p_dock, station.axis, T_dock_cam[:3, 3]) > 0.0)
 
 
-def emission_cosine(station: Station, T_dock_cam: Array) -> Array:
-    """Cosine (M,) of the angle between each lamp's axis and the direction to the camera."""
-    to_camera = T_dock_cam[:3, 3] - station.p_dock
-    return np.asarray((to_camera * station.axis).sum(axis=1) / np.linalg.norm(to_camera, axis=1))
+def emission_cosine(p_dock: Array, axis: Array, t_dock_cam: Array) -> Array:
+    """Cosine (M,) of the angle between the `axis` (M, 3) of lamps at `p_dock` (M, 3) and the way to the camera."""
+    to_camera = t_dock_cam - p_dock
+    return np.asarray((to_camera * axis).sum(axis=1) / np.linalg.norm(to_camera, axis=1))
 
 
 def dark_lights(scenario: Scenario, front_in_view: Indices, rng: np.random.Generator) -> Indices:
