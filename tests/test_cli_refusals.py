@@ -110,6 +110,22 @@ def test_a_spoilt_source_is_one_line_and_harms_nothing(not_started, sequence, sp
     not_started(match)
 
 
+@pytest.mark.parametrize(
+    ("words", "match"),
+    [
+        (["sim:nowhere"], "no such scenario"),
+        (["sim:"], "no such scenario"),
+        (["sim:approach", "--method", "dance"], "--method dance"),
+        (["sim:approach", "--config", "none.yaml"], "none.yaml: No such file"),
+        (["sim:approach", "--station", "none.yaml"], "none.yaml: No such file"),
+    ],
+    ids=lambda words: " ".join(words) if isinstance(words, list) else None,
+)
+def test_a_run_that_cannot_start_simulates_nothing(refusal, tmp_path, words, match):
+    assert match in refusal("run", *words, "--out", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize(("option", "value", "match"), WRONG_OPTIONS, ids=lambda word: str(word))
 def test_a_wrong_option_is_one_line_and_harms_nothing(not_started, monkeypatch, tmp_path, option, value, match):
     monkeypatch.chdir(tmp_path)
@@ -176,6 +192,9 @@ def test_the_source_is_not_written_into(refusal, sequence):
         (["trials", "--set", "path=[1"], "not valid YAML"),
         (["trials", "--station", "nowhere"], "nowhere: No such file"),
         (["trials", "--camera", "nowhere"], "nowhere: No such file"),
+        (["trials", "--video", "--detections"], "have no pictures"),
+        (["flat-port", "--detections"], "only rendered"),
+        (["trials", "--video", "--set", "output.pixels=mono16", "--set", "output.file=png"], "not mono16"),
     ],
     ids=lambda words: " ".join(words) if isinstance(words, list) else None,
 )

@@ -44,6 +44,7 @@ from lumidock.cli.shared import (
     prepare_folder,
     prepare_sequence,
     progress_bar,
+    require_folder,
     shipped_or_path,
     simulated,
 )
@@ -151,14 +152,15 @@ def _run(
     from lumidock.run import run as run_source
     from lumidock.streams.runfolder import RunFolder
 
+    require_method(method)
+    settings = load_config(config) if config else Config()
     if source.startswith(SIM):
-        prepare_folder(out, force)
+        require_folder(out, force)
         source, force = str(simulated(source, out / "sequence", station, camera)), True
     opened = open_any(source, fps, topic=topic, bits=bits, station=station)
     station_file = file_of("station", station, opened.station, opened)
     described = camera is None and opened.camera is None and opened.calibration is not None
     camera_file = out / "camera.yaml" if described else file_of("camera", camera, opened.camera, opened)
-    settings = load_config(config) if config else Config()
     dock = load_station(station_file)
     lens = calibration_of(camera, opened)
     localizer = localizer_of(method, dock, lens, settings, cold=cold)
@@ -218,11 +220,12 @@ def _sim(
 ) -> None:
     """Simulate SCENARIO into a sequence folder with truth."""
     from lumidock.sim.scenario import load_scenario
-    from lumidock.sim.sequence import write_detections, write_rendered
+    from lumidock.sim.sequence import require_possible, write_detections, write_rendered
 
     if video and detections:
         raise InputError("--video: bare detections have no pictures")
     loaded = load_scenario(scenario, tuple(settings or ()))
+    require_possible(loaded, detections=detections, video=video)
     station_file = shipped_or_path("station", station or DEFAULT_STATION)
     dock = load_station(station_file)
     lens = load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))

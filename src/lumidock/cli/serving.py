@@ -39,7 +39,7 @@ from lumidock.cli.shared import (
 )
 from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
-from lumidock.methods import localizer_of
+from lumidock.methods import localizer_of, require_method
 from lumidock.serve import STALE_S, Camera, Newest, Server, Worker
 from lumidock.sinks import FILE_KINDS, Numbered, RunSink, Scene, open_rerun
 from lumidock.station import load_station
@@ -115,6 +115,9 @@ def _serve(
     force: Force = False,
 ) -> None:
     """Localize live and tell the vehicle, until stopped."""
+    require_method(method)
+    settings = load_config(config) if config else Config()
+    mounting = load_vehicle(vehicle) if vehicle else None
     with ExitStack() as stack:
         if source.startswith(SIM):
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -123,8 +126,7 @@ def _serve(
         station_file = file_of("station", station, opened.station, opened)
         dock = load_station(station_file)
         lens = calibration_of(camera, opened)
-        scene = Scene(dock, lens, load_vehicle(vehicle) if vehicle else None)
-        settings = load_config(config) if config else Config()
+        scene = Scene(dock, lens, mounting)
         list(warm_up(localizer_of(method, dock, lens, settings).process, dock, lens))
         localizer = localizer_of(method, dock, lens, settings)
         sinks = [

@@ -113,12 +113,17 @@ def require_new(file: Path, force: bool) -> None:
         raise InputError(f"{file}: exists; give --force to replace it")
 
 
-def prepare_folder(folder: Path, force: bool) -> None:
-    """Make an output folder; an existing one only with `force`."""
+def require_folder(folder: Path, force: bool) -> None:
+    """Raises: InputError for a file, and for a folder that exists, unless `force`."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file")
     if folder.exists() and not force:
         raise InputError(f"{folder}: exists; give --force to write into it")
+
+
+def prepare_folder(folder: Path, force: bool) -> None:
+    """Make an output folder; an existing one only with `force`."""
+    require_folder(folder, force)
     folder.mkdir(parents=True, exist_ok=True)
 
 

@@ -78,6 +78,14 @@ def render_frame(
     return studio.develop(shot, rng), own, shot.snr[:m]
 
 
+def require_possible(scenario: Scenario, *, detections: bool = False, video: bool = False) -> None:
+    """Raises: InputError where a scenario has no bare detections, or no video can hold its pictures."""
+    if detections and scenario.lens.port is not None:
+        raise InputError(f"{scenario.name}: a flat port is only rendered, it has no bare detections")
+    if video and scenario.output.pixels not in ("bgr8", "mono8"):
+        raise InputError(f"output.pixels: a video holds bgr8 or mono8, not {scenario.output.pixels}")
+
+
 def write_rendered(
     scenario: Scenario,
     station: Station,
@@ -93,9 +101,8 @@ def write_rendered(
 
     With `video` the pictures go into video.mp4 instead of frames/.
     """
+    require_possible(scenario, video=video)
     plan, rows = _planned(scenario, station, camera, seed)
-    if video and scenario.output.pixels not in ("bgr8", "mono8"):
-        raise InputError(f"output.pixels: a video holds bgr8 or mono8, not {scenario.output.pixels}")
     (out / "frames").mkdir(parents=True, exist_ok=True)
     control = scenario.sensor.auto_exposure
     once = _once(rows)
@@ -255,8 +262,7 @@ def write_detections(scenario: Scenario, station: Station, camera: Camera, seed:
 
     Raises: InputError where the scenario has a port, which bare detections do not know.
     """
-    if scenario.lens.port is not None:
-        raise InputError(f"{scenario.name}: a flat port is only rendered, it has no bare detections")
+    require_possible(scenario, detections=True)
     out.mkdir(parents=True, exist_ok=True)
     frames = list(spot_frames(scenario, station, camera, seed))
     names = [frame.detections.frame for frame in frames]
