@@ -4,6 +4,7 @@ import csv
 import filecmp
 from dataclasses import replace
 from itertools import pairwise
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -15,8 +16,9 @@ from lumidock.errors import InputError
 from lumidock.pose import project_lights
 from lumidock.sim import knobs
 from lumidock.sim.plan import controlled, metered, plan_of
-from lumidock.sim.scenario import R_DOCK_CAM_HEAD_ON, load_scenario, shipped_scenarios
-from lumidock.sim.sequence import render_frame, write_detections, write_rendered
+from lumidock.sim.scenario import R_DOCK_CAM_HEAD_ON, Scenario, load_scenario, shipped_scenarios
+from lumidock.sim.sequence import render_frame, rendered, write_detections, write_rendered
+from lumidock.sim.spots import spot_frames
 from lumidock.sim.stream import rows_of
 from lumidock.streams.images import read_image
 from lumidock.streams.sources import open_source
@@ -232,6 +234,31 @@ def test_what_cannot_be_is_refused_in_one_line(setting):
     with pytest.raises(InputError) as caught:
         load_scenario("approach", (setting,))
     assert "\n" not in str(caught.value)
+
+
+def knob_names(section, prefix=""):
+    """Names of all knobs of a section and of those below it."""
+    for name, field in section.model_fields.items():
+        kinds = [kind for kind in (field.annotation, *get_args(field.annotation)) if isinstance(kind, type)]
+        below = [kind for kind in kinds if issubclass(kind, knobs.Section)]
+        yield from knob_names(below[0], f"{prefix}{name}.") if below else [f"{prefix}{name}"]
+
+
+@pytest.mark.parametrize("section", [name for name in Scenario.model_fields if name not in ("name", "about", "config")])
+@pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")
+def test_absurd_settings_are_refused_or_simulated(section, tmp_path):
+    path = ("path.start_z_m=4", "path.end_z_m=3.5", "path.frame_interval_s=0.5")
+    refusals = []
+    for name in knob_names(Scenario.model_fields[section].annotation, f"{section}."):
+        for value in ("1e-300", "1e300", "[1e-300, 1e-300]", "[1e300, 1e300]", "[1e300, 1e300, 1e300]"):
+            try:
+                scenario = load_scenario("approach", (*path, f"{name}={value}"))
+                list(spot_frames(scenario, STATION, SMALL, 0))
+                rendered(scenario, STATION, SMALL, 0, tmp_path)
+            except InputError as error:
+                refusals.append(str(error))
+    assert refusals
+    assert not any("\n" in text for text in refusals)
 
 
 def test_a_video_holds_the_pictures(tmp_path):

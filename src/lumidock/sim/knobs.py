@@ -18,9 +18,12 @@ from pydantic import (
 
 Distance = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Count = Annotated[int, Field(ge=0, le=1000)]
-Triple = tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat]
+Reach = Annotated[float, Field(ge=0.0, le=1000.0)]
+Reaches = tuple[Reach, Reach, Reach]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Angle = Annotated[float, Field(ge=0.0, le=180.0)]
+Angles = tuple[Angle, Angle, Angle]
+Pixels = Annotated[float, Field(ge=0.1, le=1000.0)]
 Coefficient = Annotated[float, Field(ge=0.0, le=20.0)]
 Coefficients = tuple[Coefficient, Coefficient, Coefficient]
 Place = tuple[Distance, Distance, Distance]
@@ -39,7 +42,10 @@ def _rising(bounds: tuple[Any, Any]) -> tuple[Any, Any]:
 
 # a number or a range [lo, hi], from which a draw is uniform
 Counts = Annotated[tuple[Count, Count], BeforeValidator(_pair), AfterValidator(_rising)]
-Lengths = Annotated[tuple[PositiveFloat, PositiveFloat], BeforeValidator(_pair), AfterValidator(_rising)]
+Length = Annotated[float, Field(ge=1e-6, le=1e6)]
+Lengths = Annotated[tuple[Length, Length], BeforeValidator(_pair), AfterValidator(_rising)]
+Size = Annotated[float, Field(ge=0.01, le=100.0)]
+Sizes = Annotated[tuple[Size, Size], BeforeValidator(_pair), AfterValidator(_rising)]
 Shares = Annotated[tuple[Probability, Probability], BeforeValidator(_pair), AfterValidator(_rising)]
 Interval = Annotated[tuple[NonNegativeFloat, NonNegativeFloat], AfterValidator(_rising)]
 
@@ -118,7 +124,7 @@ class Snow(Section):
     per_m3: Annotated[float, Field(ge=0.0, le=200.0)] = (
         20.0  # larger than half a millimetre: 1-100 (Alldredge & Silver 1988)
     )
-    radius_mm: Lengths = (0.25, 1.5)  # drawn as 1 / radius^3
+    radius_mm: Sizes = (0.25, 1.5)  # drawn as 1 / radius^3
     albedo: Probability = 0.3
     reach_m: Annotated[float, Field(gt=0.0, le=10.0)] = 3.0
     drift_m_s: tuple[float, float, float] = (0.05, -0.01, 0.02)  # in dock
@@ -139,8 +145,8 @@ class Fish(Section):
     """Dark bodies that cross the view."""
 
     count: Annotated[int, Field(ge=1, le=100)] = 3
-    length_m: Lengths = (0.2, 0.5)
-    distance_m: Lengths = (1.5, 4.0)  # from the camera
+    length_m: Sizes = (0.2, 0.5)
+    distance_m: Sizes = (1.5, 4.0)  # from the camera
     speed_m_s: Lengths = (0.2, 0.6)
 
 
@@ -174,14 +180,14 @@ class Port(Section):
 class Lens(Section):
     """7.2 mm f/2.8; camera.yaml says how it projects."""
 
-    f_number: PositiveFloat = 2.8
-    focal_m: PositiveFloat = 7.2e-3
-    blur_px: PositiveFloat = 0.7  # 1 sigma
+    f_number: Annotated[float, Field(ge=0.5, le=100.0)] = 2.8
+    focal_m: Annotated[float, Field(ge=1e-4, le=1.0)] = 7.2e-3
+    blur_px: Pixels = 0.7  # 1 sigma
     falloff: Probability = 0.1  # loss at the corner beyond the cosine law
     glare: Probability = 0.01  # share of all light that the lens scatters, about 1 %
-    glare_px: PositiveFloat = 60.0  # half of it within about twice this
+    glare_px: Pixels = 60.0  # half of it within about twice this
     ghost: Probability = 1e-5  # share that is mirrored about the centre: two reflections of 0.3 %
-    ghost_px: PositiveFloat = 40.0  # radius of that
+    ghost_px: Pixels = 40.0  # radius of that
     port: Port | None = None
     focal_error: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0  # the true focal length over camera.yaml's, less one
     motion: bool = True  # blur along the way during the exposure
@@ -203,9 +209,9 @@ class Sensor(Section):
     exposure_ms: Annotated[float, Field(gt=0.0, le=1000.0)] = 2.0
     auto_exposure: AutoExposure | None = None
     gain_db: Annotated[float, Field(ge=0.0, le=36.0)] = 0.0
-    full_well_e: PositiveFloat = 10700.0
-    read_noise_e: NonNegativeFloat = 2.3
-    gamma: PositiveFloat = 2.2
+    full_well_e: Annotated[float, Field(ge=1.0, le=1e9)] = 10700.0
+    read_noise_e: Annotated[float, Field(ge=0.0, le=1e6)] = 2.3
+    gamma: Annotated[float, Field(ge=0.1, le=10.0)] = 2.2
     hot_pixels: Count = 0  # fixed for a run
     hot_e_s: Lengths = (2e4, 5e5)  # electrons a second of each
 
@@ -240,5 +246,5 @@ class Stream(Section):
     black: Probability = 0.0  # all zero
     white: Probability = 0.0  # all at full scale
     over_exposed: Probability = 0.0  # at 50 times the exposure
-    clock_jump_s: float = 0.0  # how far the clock jumps ...
+    clock_jump_s: Annotated[float, Field(ge=-1e9, le=1e9)] = 0.0  # how far the clock jumps ...
     clock_jumps: Probability = 0.0  # ... and how often

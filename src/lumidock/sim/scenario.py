@@ -14,6 +14,7 @@ from lumidock.datatypes import Array
 from lumidock.errors import InputError
 from lumidock.sim.knobs import (
     Angle,
+    Angles,
     Around,
     Counts,
     Daylight,
@@ -24,10 +25,10 @@ from lumidock.sim.knobs import (
     Lens,
     Output,
     Probability,
+    Reaches,
     Section,
     Sensor,
     Stream,
-    Triple,
     Water,
 )
 from lumidock.yamlfile import read_mapping, validate
@@ -52,17 +53,17 @@ class Path3D(Section):
     frame_interval_s: PositiveFloat = 0.15
     half_width_m: Annotated[float, Field(gt=0, le=1000)] = 9.0  # of the rectangle
     half_height_m: Annotated[float, Field(gt=0, le=1000)] = 7.5
-    sway_m: Triple = (0.7, 0.7, 0.0)  # largest excursion in x, y, z
-    sway_deg: Triple = (2.1, 2.1, 3.0)  # largest pitch, yaw, roll
-    near_sway_m: Triple = (0.035, 0.035, 0.0)  # the same, at and below taper_z_m[1]
-    near_sway_deg: Triple = (0.35, 0.35, 0.5)
+    sway_m: Reaches = (0.7, 0.7, 0.0)  # largest excursion in x, y, z
+    sway_deg: Angles = (2.1, 2.1, 3.0)  # largest pitch, yaw, roll
+    near_sway_m: Reaches = (0.035, 0.035, 0.0)  # the same, at and below taper_z_m[1]
+    near_sway_deg: Angles = (0.35, 0.35, 0.5)
     taper_z_m: tuple[float, float] = (15.0, 2.0)  # the sway shrinks between these
     sway_period_s: tuple[PositiveFloat, PositiveFloat] = (7.0, 20.0)
     count: PositiveInt = 1000  # draws
     hold: PositiveInt = 1  # frames in a row from each draw, moving toward the dock at speed_m_s
     hold_deg_s: NonNegativeFloat = 2.0  # largest rate in them about each axis
     z_m: Lengths = (3.0, 19.0)  # of the draws
-    turn_deg: tuple[Angle, Angle, Angle] = (3.0, 3.0, 3.0)  # largest pitch, yaw, roll of the draws, each uniform
+    turn_deg: Angles = (3.0, 3.0, 3.0)  # largest pitch, yaw, roll of the draws, each uniform
     tilt_deg: Angle | None = None  # in place of pitch and yaw: angle uniform up to it, in a uniform direction
 
     @model_validator(mode="after")
@@ -103,8 +104,8 @@ class Faults(Section):
 class AttitudeSensor(Section):
     """The vehicle's own compass and tilt sensors, 1 sigma about each axis."""
 
-    bias_deg: PositiveFloat = 2.0  # one for a run
-    noise_deg: NonNegativeFloat = 0.1  # in each frame
+    bias_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 2.0  # one for a run
+    noise_deg: Angle = 0.1  # in each frame
 
 
 class BlackOuts(Section):
@@ -128,7 +129,8 @@ class Spots(Section):
     color: bool = True  # without it p_rear is unknown
     drop: Probability = 0.0  # of each light, front or rear, in each frame
     dead: Counts = (0, 0)  # lights, front or rear, that are dark through a run
-    clutter: NonNegativeFloat = 0.0  # mean number of further spurious spots, Poisson and new in each frame
+    # mean number of further spurious spots, Poisson and new in each frame
+    clutter: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
     place: Literal["picture", "beside"] = "picture"  # of what is drawn anew: beside is the box of the array and 50 %
     dock: bool = True  # whether it is in view at all
     mirror: Literal["none", "only"] = "none"  # only: the array is seen in the water surface above it, and not itself
