@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from commandline import PAPER, contents, fixes, start
-from test_run import stamps
+from test_run import simulate, stamps
 from test_sources import write_video
 
 
@@ -215,12 +215,15 @@ def test_a_simulation_that_cannot_start_touches_nothing(refusal, sequence, words
         (["RUN", "RUN"], "earlier/truth.csv: No such file"),
         (["RUN", "none"], "none: No such file"),
         (["RUN", "RUN/fixes.csv"], "earlier/fixes.csv: "),
+        (["RUN", "SLOWER"], "another sequence"),
     ],
     ids="-".join,
 )
-def test_an_evaluation_of_the_wrong_folders_is_one_line(refusal, sequence, earlier, words, match):
+def test_an_evaluation_of_the_wrong_folders_is_one_line(refusal, sequence, earlier, tmp_path, words, match):
     if words[1].startswith("RUN/"):
         (earlier / "fixes.csv").write_text("frame\n")
-    names = {"SEQUENCE": str(sequence), "RUN": str(earlier)}
+    if words[1] == "SLOWER":
+        simulate(tmp_path / "slower", "path.frame_interval_s=0.4", bare=True)
+    names = {"SEQUENCE": str(sequence), "RUN": str(earlier), "SLOWER": str(tmp_path / "slower")}
     full = [names.get(word.split("/")[0], word) + word[len(word.split("/")[0]) :] for word in words]
     assert match in refusal("eval", *full)

@@ -1,4 +1,5 @@
 import csv
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -348,3 +349,30 @@ def test_what_cannot_be_judged_is_refused(tmp_path, change, match):
     change(tmp_path)
     with refused(tmp_path, match):
         evaluate(tmp_path / "run", tmp_path / "truth")
+
+
+@pytest.mark.parametrize(
+    ("true_ns", "kind", "good"),
+    [
+        ([0, 1, 2, 3, 4], "sequence", True),
+        ([7, 8, 9, 10, 11], "sequence", True),  # another epoch
+        ([0, 1, 2, 9, 4], "sequence", True),  # a broken stamp
+        ([0, 0, 0, 0, 0], "sequence", True),  # a truth without times
+        ([0, 2, 4, 6, 8], "sequence", False),
+        ([0, 2, 4, 6, 8], "bag", False),
+        ([0, 2, 4, 6, 8], "images", True),  # whose times are of --fps
+    ],
+)
+def test_the_truth_of_other_frames_is_told_by_their_times(tmp_path, true_ns, kind, good):
+    poses = {f"{k:06d}": pose(0, 0, 10 - k) for k in range(5)}
+    write_run(tmp_path / "run", poses)
+    (tmp_path / "run" / "run.json").write_text(json.dumps({"source": {"kind": kind}}))
+    write_truth(tmp_path / "truth", poses)
+    lines = (tmp_path / "truth" / "truth.csv").read_text().splitlines()
+    rows = [line.replace(",0,", f",{t}000000000,", 1) for line, t in zip(lines[1:], true_ns, strict=True)]
+    (tmp_path / "truth" / "truth.csv").write_text("\n".join([lines[0], *rows]) + "\n")
+    if good:
+        assert evaluate(tmp_path / "run", tmp_path / "truth")["valid"] == 5
+    else:
+        with refused(tmp_path / "truth", "another sequence"):
+            evaluate(tmp_path / "run", tmp_path / "truth")

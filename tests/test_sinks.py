@@ -247,6 +247,7 @@ def test_an_export_that_cannot_be_is_refused(lumidock, run, tmp_path, words, mat
     code, out, err = lumidock("export", run, *words)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert match in err
+    assert not list(tmp_path.glob("fixes.*"))
 
 
 def test_an_existing_file_is_kept_unless_forced(lumidock, run, tmp_path):

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from lumidock.datatypes import Detections, Frame, Unusable
 from lumidock.errors import InputError
+from lumidock.streams.live import open_live
 from lumidock.streams.sources import open_source
 
 PICTURES = np.random.default_rng(2).integers(0, 256, (4, 6, 8, 3), np.uint8)
@@ -376,3 +377,10 @@ def test_a_quaternion_of_any_length_is_a_rotation(sigmas, tmp_path):
 def test_a_table_without_an_attitude_is_refused(sigmas, tmp_path, rows, header, match):
     with refused(tmp_path / "attitude.csv", match):
         sigmas(rows, [0], header)
+
+
+@pytest.mark.parametrize("address", ["rtsp://", "rtsp:///front", "rtsp://user:secret@", "rtsp://[", "rtp://:5600"])
+def test_a_stream_without_a_host_is_refused_and_its_password_kept(address):
+    with pytest.raises(InputError, match="no host in the address") as caught:
+        open_live(address)
+    assert "secret" not in str(caught.value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
@@ -42,12 +43,14 @@ def export(
     scene = Scene(load_station(run / "station.yaml"), load_camera(run / "camera.yaml"), vehicle)
     sink, done = open_file_sink(target, scene), 0
     try:
-        for item, fix, latency_us in _frames(run, scene, source):
-            sink.add(item, fix, latency_us)
-            done += 1
-            progress(done, source.count if source else None)
-    finally:
-        sink.close()
+        with closing(sink):
+            for item, fix, latency_us in _frames(run, scene, source):
+                sink.add(item, fix, latency_us)
+                done += 1
+                progress(done, source.count if source else None)
+    except InputError:
+        target.unlink(missing_ok=True)  # what was begun is of no use
+        raise
     return done
 
 

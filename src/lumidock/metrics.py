@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +23,8 @@ from lumidock.trust import GuideClaims, PoseClaims
 
 _POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _SAME_SPOT_PX = 3.0  # a named detection this close to its light's true centre was made by it
+_WITHOUT_STAMPS = ("images", "video")  # sources whose times may be made up
+_STAMP = re.compile(r"-?[0-9]{1,18}")
 _RANGE_BINS_M = (-3.0, 0.0, 3.0, 8.0, 12.0, 18.0, 24.0, 30.0)
 
 Row = dict[str, str]
@@ -43,9 +46,8 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
     """
     folder = truth if truth.is_dir() else truth.parent
     true, path = true_poses(truth), run_folder / "fixes.csv"
-    fixes = read_rows(path, ("frame", "t_ns", "valid", "reason", *_POSE))
-    if fixes and not any(row["frame"] in true for row in fixes):
-        raise InputError(f"{truth}: knows none of the run's frames")
+    fixes, described = read_rows(path, ("frame", "t_ns", "valid", "reason", *_POSE)), _described(run_folder)
+    _require_same_frames(truth, fixes, true, stamped=_source_kind(described) not in _WITHOUT_STAMPS)
     poses = {row["frame"]: _pose(path, row) for row in fixes if row["valid"] == "1"}
     gaps = {word: trust.continuity(_stamps(path, fixes, word)) for word in ("valid", "guide")}
     result: dict[str, Any] = {
@@ -58,7 +60,7 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
         "continuity": gaps,
     }
     result["availability"] = _shares(result)
-    result["nis"] = _nis(run_folder)
+    result["nis"] = _nis(described)
     result |= _judge(path, [row for row in fixes if row["frame"] in true], true)
     if (run_folder / "layers.csv").exists():
         result["layers"] = _layers(run_folder, true)
@@ -69,14 +71,46 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
     return result
 
 
-def _nis(run_folder: Path) -> dict[str, float] | None:
+def _described(run_folder: Path) -> Any:  # noqa: ANN401  # whatever a JSON file holds
+    """The run.json of a run; None where another program made it."""
+    try:
+        return json.loads((run_folder / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _source_kind(described: Any) -> str:  # noqa: ANN401
+    try:
+        return str(described["source"]["kind"])
+    except (KeyError, TypeError):
+        return ""
+
+
+def _nis(described: Any) -> dict[str, float] | None:  # noqa: ANN401
     """Mean innovation squared per degree of freedom, over the tracked frames, as the run has summed it up."""
     try:
-        content = json.loads((run_folder / "run.json").read_text(encoding="utf-8"))
-        nis = content["counts"]["nis"]
+        nis = described["counts"]["nis"]
         return None if nis is None else {"frames": int(nis["frames"]), "mean": float(nis["mean"])}
-    except (OSError, ValueError, KeyError, TypeError):  # a run of another program
+    except (KeyError, TypeError, ValueError):
         return None
+
+
+def _require_same_frames(truth: Path, fixes: list[Row], true: dict[str, Array], *, stamped: bool) -> None:
+    """Raises: InputError for the truth of other frames, told by their names or, in a `stamped` run, by their times.
+
+    Every simulated sequence has a frame 000000. Some stamps may be broken, or off by a constant.
+    """
+    known = [row for row in fixes if row["frame"] in true]
+    if fixes and not known:
+        raise InputError(f"{truth}: knows none of the run's frames")
+    path = truth / "truth.csv" if truth.is_dir() else truth
+    true_stamp = {row["frame"]: row.get("t_ns", "") for row in read_rows(path, ("frame",))}
+    pairs = [(row["t_ns"], true_stamp[row["frame"]]) for row in known]
+    t_ns = np.array([pair for pair in pairs if all(map(_STAMP.fullmatch, pair))], np.int64).reshape(-1, 2)
+    steps = np.diff(t_ns, axis=0)
+    usual = np.median(np.abs(steps[:, 1])) if len(steps) else 0.0
+    if stamped and usual > 0.0 and (np.abs(steps[:, 0] - steps[:, 1]) > 0.25 * usual).mean() > 0.5:
+        raise InputError(f"{truth}: its frames were not taken at the times of the run's: another sequence")
 
 
 def _judge(path: Path, fixes: list[Row], true: dict[str, Array]) -> dict[str, Any]:

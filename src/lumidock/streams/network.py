@@ -29,8 +29,15 @@ a=rtpmap:96 H264/90000
 
 
 def without_password(address: str) -> str:
-    """Host and path of an address, fit to be written down."""
-    parts = urlsplit(address)
+    """Host and path of an address, fit to be written down. Raises: InputError where it names no host."""
+    try:
+        parts = urlsplit(address)
+    except ValueError:
+        parts = urlsplit("")
+    if not parts.hostname:
+        raise InputError(
+            f"{address.partition(':')[0]}: no host in the address; wanted rtsp://HOST/PATH, rtp://HOST:PORT"
+        )
     return f"{parts.hostname}{parts.path}"
 
 
