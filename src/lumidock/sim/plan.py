@@ -10,12 +10,13 @@ import numpy as np
 from lumidock.camera import Camera
 from lumidock.datatypes import Array, Indices
 from lumidock.geometry import se3_exp, se3_inverse, se3_log
+from lumidock.sim.course import Course, course_of
 from lumidock.sim.frames import Moment, Studio
 from lumidock.sim.knobs import AutoExposure, Surface
 from lumidock.sim.lens import Lens
 from lumidock.sim.scenario import Scenario, spurious_paths
 from lumidock.sim.sensor import LEVELS, electrons_per_level
-from lumidock.sim.spots import Course, World, course_of, dark_lights, failed, in_view, world_of
+from lumidock.sim.spots import World, dark_lights, failed, in_view, world_of
 from lumidock.sim.water import green_index
 from lumidock.station import Station
 

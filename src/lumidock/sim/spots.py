@@ -13,25 +13,12 @@ import numpy as np
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Array, Attitude, Detections, Indices
-from lumidock.errors import InputError
 from lumidock.pose import project_lights
+from lumidock.sim.course import Course, course_of, mirror_image, project_each, shines
 from lumidock.sim.measured import Looks, SpotTable, as_measured, detector_errors, with_false
-from lumidock.sim.scenario import (
-    R_DOCK_CAM_HEAD_ON,
-    BlackOuts,
-    Path3D,
-    Scenario,
-    draw_stamps,
-    poses,
-    rotations,
-    spurious_paths,
-    trajectory,
-)
+from lumidock.sim.scenario import BlackOuts, Scenario, rotations, spurious_paths
 from lumidock.station import Station
 
-_MAX_ROUNDS = 2000  # of drawing poses until all have the front layer in view
-_EDGE_PX = 20.0  # kept clear in draws, so that no error of the lens puts a light outside
-_MIRROR_SIDE_M, _MIRROR_DEPTH_M, _MIRROR_AIM_DEG = 1.0, 0.5, 15.0
 _P_REAR = (0.05, 0.95)
 
 
@@ -51,22 +38,6 @@ class SpotFrame:
     in_view: np.ndarray
     sequence: int = 0
     step: int = 0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Course:
-    """Where the camera is, in N frames of G runs.
-
-    `t_ns` (N,), `T_dock_cam` (N, 4, 4), the `run` (N,) that each frame belongs to and its `step` (N,) there;
-    `missing_from` (N,) is the frame with the same missing lights; `surface_m` (G,) how high the water stands.
-    """
-
-    t_ns: np.ndarray
-    T_dock_cam: Array
-    run: Indices
-    step: Indices
-    missing_from: Indices
-    surface_m: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,111 +110,6 @@ def spot_frames(scenario: Scenario, station: Station, camera: Camera, seed: int)
     )
 
 
-def course_of(scenario: Scenario, station: Station, camera: Camera, rng: np.random.Generator) -> Course:
-    """The camera's way. Raises: InputError when no pose has the front layer in view."""
-    path = scenario.path
-    if path.kind == "draws":
-        T_dock_cam, surface_m = _draws(scenario, station, camera, rng)
-        run, step = np.divmod(np.arange(path.count * path.hold), path.hold)
-        stamps = draw_stamps(path).ravel()
-        return Course(stamps, T_dock_cam.reshape(-1, 4, 4), run, step, run * path.hold, surface_m)
-    t_ns, T_dock_cam = trajectory(scenario, rng)
-    frames = np.arange(len(t_ns))
-    return Course(t_ns, T_dock_cam, np.zeros_like(frames), frames, frames, np.array([np.inf]))
-
-
-def _draws(scenario: Scenario, station: Station, camera: Camera, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Poses (count, hold, 4, 4) with all front lights in view, and the water's surface (count,) above the dock."""
-    path = scenario.path
-    z_m, surface_m = rng.uniform(*path.z_m, path.count), rng.uniform(*scenario.spots.surface_m, path.count)
-    T_dock_cam, todo = np.empty((path.count, path.hold, 4, 4)), np.arange(path.count)
-    for _ in range(_MAX_ROUNDS):
-        if scenario.spots.mirror == "only":
-            drawn = _looking_up(path, z_m[todo], surface_m[todo], rng)
-        else:
-            drawn = _looking_around(path, camera, z_m[todo], rng)
-        held = _held(path, drawn, rng)
-        good = _front_in_view(scenario, station, camera, held, surface_m[todo])
-        T_dock_cam[todo[good]], todo = held[good], todo[~good]
-        if not len(todo):
-            return T_dock_cam, surface_m
-    raise InputError(f"{scenario.name}: no pose at {z_m[todo[0]]:.2f} m has all lights of the front layer in view")
-
-
-def _looking_around(path: Path3D, camera: Camera, z_m: Array, rng: np.random.Generator) -> Array:
-    """Poses (n, 4, 4) at `z_m` (n,), the dock's origin anywhere in the picture, each place as likely."""
-    R_dock_cam = _turned(path, len(z_m), rng)
-    uv = rng.uniform(0.0, 1.0, (len(z_m), 2)) * [camera.width, camera.height] - 0.5
-    ray_dock = (R_dock_cam @ camera.unproject(uv)[:, :, None])[:, :, 0]
-    ray_dock[ray_dock[:, 2] >= -0.01] = np.nan  # the dock's plane is behind, or seen edge on
-    return poses(R_dock_cam, ray_dock * (z_m / ray_dock[:, 2])[:, None])
-
-
-def _turned(path: Path3D, n: int, rng: np.random.Generator) -> Array:
-    """Attitudes (n, 3, 3): first the tilt, then the roll about the camera's own axis."""
-    w = rng.uniform(-1.0, 1.0, (n, 3)) * np.deg2rad(path.turn_deg)
-    roll = w * [0.0, 0.0, 1.0]
-    if path.tilt_deg is not None:
-        angle, direction = rng.uniform(0.0, np.deg2rad(path.tilt_deg), n), rng.uniform(0.0, 2 * np.pi, n)
-        w[:, 0], w[:, 1] = angle * np.cos(direction), angle * np.sin(direction)
-    return np.asarray(R_DOCK_CAM_HEAD_ON @ rotations(w - roll) @ rotations(roll))
-
-
-def _looking_up(path: Path3D, z_m: Array, surface_m: Array, rng: np.random.Generator) -> Array:
-    """Poses (n, 4, 4) below the surface, pitched toward the place where it mirrors the dock."""
-    n, aim = len(z_m), np.deg2rad(_MIRROR_AIM_DEG)
-    x = rng.uniform(-_MIRROR_SIDE_M, _MIRROR_SIDE_M, n)
-    y = rng.uniform(-_MIRROR_SIDE_M, np.minimum(surface_m - _MIRROR_DEPTH_M, _MIRROR_SIDE_M))
-    pitch, still = np.arctan2(2.0 * surface_m - y, z_m) + rng.uniform(-aim, aim, n), np.zeros(n)
-    R_pitch = rotations(np.stack([pitch, still, still], axis=1))
-    R_turn = rotations(rng.uniform(-1.0, 1.0, (n, 3)) * np.deg2rad(path.turn_deg))
-    return poses(R_DOCK_CAM_HEAD_ON @ R_pitch @ R_turn, np.stack([x, y, z_m], axis=1))
-
-
-def _held(path: Path3D, drawn: Array, rng: np.random.Generator) -> Array:
-    """Poses (n, hold, 4, 4) that follow from each of `drawn` (n, 4, 4): mostly ahead, turning slowly."""
-    n, t_s = len(drawn), np.arange(path.hold) * path.frame_interval_s
-    velocity = path.speed_m_s * np.stack([*(0.2 * rng.normal(size=(2, n))), np.full(n, -1.0)], axis=1)
-    rate = rng.uniform(-1.0, 1.0, (n, 3)) * np.deg2rad(path.hold_deg_s)
-    turn = rotations((rate[:, None] * t_s[:, None]).reshape(-1, 3)).reshape(n, path.hold, 3, 3)
-    position = drawn[:, None, :3, 3] + velocity[:, None] * t_s[:, None]
-    R_dock_cam = drawn[:, None, :3, :3] @ turn
-    return poses(R_dock_cam.reshape(-1, 3, 3), position.reshape(-1, 3)).reshape(n, path.hold, 4, 4)
-
-
-def _front_in_view(scenario: Scenario, station: Station, camera: Camera, held: Array, surface_m: Array) -> np.ndarray:
-    """Which of `held` (n, K, 4, 4) have the whole front layer, or its mirror image, in view in all K frames: (n,)."""
-    n, k = held.shape[:2]
-    front = station.lights_of(station.layers_front_to_rear()[0])
-    p_dock, T_dock_cam = np.broadcast_to(station.p_dock[front], (n * k, len(front), 3)), held.reshape(-1, 4, 4)
-    if scenario.spots.mirror == "only":
-        p_dock = _mirrored(p_dock, np.repeat(surface_m, k))
-    uv, p_cam = _project(camera, T_dock_cam, p_dock)
-    shining = _shining(station.axis[front], scenario, T_dock_cam, p_dock)
-    good = camera.contains(uv, margin_px=_EDGE_PX) & (p_cam[..., 2] > 0.0) & shining
-    return np.asarray(good.reshape(n, -1).all(axis=1))
-
-
-def _mirrored(p_dock: Array, surface_m: Array) -> Array:
-    """Where points (N, M, 3) are seen in a water surface `surface_m` (N,) above the dock's origin."""
-    image = p_dock * [1.0, -1.0, 1.0]
-    image[:, :, 1] += 2.0 * surface_m[:, None]
-    return image
-
-
-def _project(camera: Camera, T_dock_cam: Array, p_dock: Array) -> tuple[Array, Array]:
-    """Pixels (N, M, 2) and camera coordinates (N, M, 3) of points `p_dock` (N, M, 3), each frame's from its pose."""
-    p_cam = (p_dock - T_dock_cam[:, None, :3, 3]) @ T_dock_cam[:, :3, :3]
-    return camera.project(p_cam.reshape(-1, 3)).reshape(*p_dock.shape[:2], 2), p_cam
-
-
-def _shining(axis: Array, scenario: Scenario, T_dock_cam: Array, p_dock: Array) -> np.ndarray:
-    """Which lights (N, M), or mirror images of them, send light toward the camera; `axis` (M, 3)."""
-    if scenario.spots.mirror == "only":
-        axis = axis * [1.0, -1.0, 1.0]
-    return np.asarray(((T_dock_cam[:, None, :3, 3] - p_dock) * axis).sum(axis=2) > 0.0)
-
-
 def world_of(scenario: Scenario, station: Station, course: Course, rng: np.random.Generator) -> World:
     """What the run's draws decide; without survey and calibration errors, what the station and the camera say."""
     g, m, spots = len(course.surface_m), len(station), scenario.spots
@@ -285,12 +151,12 @@ def _shown(
     """True pixels (N, M, 2) of all lights, or of their mirror images, which (N, M) can be seen, and ranges (N, M) m."""
     p_dock = world.p_dock[course.run]
     if scenario.spots.mirror == "only":
-        p_dock = _mirrored(p_dock, course.surface_m[course.run])
-    uv, p_cam = _project(camera, course.T_dock_cam, p_dock)
+        p_dock = mirror_image(p_dock, course.surface_m[course.run])
+    uv, p_cam = project_each(camera, course.T_dock_cam, p_dock)
     uv = _through_lens(camera, course, world, uv)
     range_m = np.linalg.norm(p_cam, axis=2)
     seen = camera.contains(uv) & (range_m < world.reach_m[course.run]) & shown_layers(scenario, station)
-    shining = _shining(station.axis, scenario, course.T_dock_cam, p_dock)
+    shining = shines(station.axis, scenario, course.T_dock_cam, p_dock)
     return uv, seen & shining & scenario.spots.dock, range_m
 
 
@@ -316,7 +182,7 @@ def _unseen(scenario: Scenario, camera: Camera, course: Course, world: World, uv
     """True pixels (N, M, 2) of a dock that is not seen; NaN when there is none."""
     if not scenario.spots.dock:
         return np.full_like(uv, np.nan)
-    return _through_lens(camera, course, world, _project(camera, course.T_dock_cam, world.p_dock[course.run])[0])
+    return _through_lens(camera, course, world, project_each(camera, course.T_dock_cam, world.p_dock[course.run])[0])
 
 
 def _dark(
