@@ -28,7 +28,7 @@ _MARGIN, _DOCK_M = 1.7, 2.0  # of the dock's size, which fills each tile
 
 
 def picture(scenario: str, z_m: float) -> Image:
-    """A frame from the dock's axis."""
+    """A frame (2048, 2448, 3) from `z_m` before the dock, on its axis."""
     station = shipped_station()
     plan = plan_of(load_scenario(scenario), station, shipped_camera(), 0)
     T_dock_cam = np.eye(4)
@@ -39,7 +39,7 @@ def picture(scenario: str, z_m: float) -> Image:
 
 
 def tile(image: Image, z_m: float) -> Image:
-    """The part of a frame around the dock, larger the farther it is; at most the whole frame."""
+    """The part of a frame around the dock, (384, 460, 3), larger the farther it is."""
     height, width = image.shape[:2]
     span = min(_MARGIN * _DOCK_M * float(shipped_camera().focal_px[1]) / max(z_m, 0.1), float(height))
     half = np.array([span * _TILE[0] / _TILE[1], span]) / 2.0

@@ -56,7 +56,7 @@ Cells = dict[str, list[Cell]]
 
 
 def band(range_m: Array) -> np.ndarray:
-    """The band of each range."""
+    """The band of each range, of any shape."""
     return np.asarray(np.searchsorted(EDGES_M, range_m, side="right") - 1)
 
 

@@ -27,7 +27,7 @@ _COLD = {
 
 
 def cold_ms(scenario: str, settings: tuple[str, ...]) -> np.ndarray:
-    """Milliseconds of `match.acquire` on each of some frames of a scenario."""
+    """Milliseconds (N,) of `match.acquire` on each of some frames of a scenario."""
     station, camera, config = shipped_station(), shipped_camera(), Config()
     plan, expected = match.plan(station, camera, config.match), match.prior(None, config.prior)
     times = []
@@ -40,7 +40,7 @@ def cold_ms(scenario: str, settings: tuple[str, ...]) -> np.ndarray:
 
 
 def warm_ms() -> np.ndarray:
-    """Milliseconds of each frame of a nominal run through the light door, the cold ones left out."""
+    """Milliseconds (N,) of each frame of a nominal run through the light door, the cold ones left out."""
     localizer = Localizer(shipped_station(), shipped_camera())
     frames: list[Detections] = [
         frame.detections for frame in spot_frames(load_scenario("nominal"), localizer.station, localizer.camera, _SEED)

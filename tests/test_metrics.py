@@ -361,6 +361,7 @@ def test_what_cannot_be_judged_is_refused(tmp_path, change, match):
         ([0, 2, 4, 6, 8], "sequence", False),
         ([0, 2, 4, 6, 8], "bag", False),
         ([0, 2, 4, 6, 8], "images", True),  # whose times are of --fps
+        ([0, 2, 4, 6, 8], "stream", True),  # whose times are of this machine
     ],
 )
 def test_the_truth_of_other_frames_is_told_by_their_times(tmp_path, true_ns, kind, good):

@@ -23,7 +23,7 @@ from lumidock.trust import GuideClaims, PoseClaims
 
 _POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _SAME_SPOT_PX = 3.0  # a named detection this close to its light's true centre was made by it
-_WITHOUT_STAMPS = ("images", "video")  # sources whose times may be made up
+_STAMPED = ("sequence", "detections", "bag")  # sources whose times are not made up or measured anew
 _STAMP = re.compile(r"-?[0-9]{1,18}")
 _RANGE_BINS_M = (-3.0, 0.0, 3.0, 8.0, 12.0, 18.0, 24.0, 30.0)
 
@@ -47,7 +47,7 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
     folder = truth if truth.is_dir() else truth.parent
     true, path = true_poses(truth), run_folder / "fixes.csv"
     fixes, described = read_rows(path, ("frame", "t_ns", "valid", "reason", *_POSE)), _described(run_folder)
-    _require_same_frames(truth, fixes, true, stamped=_source_kind(described) not in _WITHOUT_STAMPS)
+    _require_same_frames(truth, fixes, true, stamped=_source_kind(described) in _STAMPED)
     poses = {row["frame"]: _pose(path, row) for row in fixes if row["valid"] == "1"}
     gaps = {word: trust.continuity(_stamps(path, fixes, word)) for word in ("valid", "guide")}
     result: dict[str, Any] = {

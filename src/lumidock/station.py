@@ -61,7 +61,7 @@ class Station:
         return len(self.ids)
 
     def lights_of(self, layer: str) -> Indices:
-        """Indices of the lights of one layer. Raises: ValueError for a layer the station does not have."""
+        """Indices (K,) of the lights of one layer. Raises: ValueError for a layer the station does not have."""
         return np.flatnonzero(self.layer == self.layers.index(layer)).astype(np.int64)
 
     def layers_front_to_rear(self) -> tuple[str, ...]:

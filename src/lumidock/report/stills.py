@@ -20,7 +20,7 @@ _STAGE_COLORS = {"search": "#7f7f7f", "front": "#d9860a", "transition": "#2a9d5c
 
 
 def plot_trajectory(fixes: Sequence[Fix], truth: dict[str, Array], station: Station, out: Path) -> None:
-    """Top view, side view and errors of a run against the true poses `T_dock_cam` by frame name; writes a PNG.
+    """Top view, side view and errors of a run against true poses `T_dock_cam` (4, 4) by frame; writes a PNG.
 
     Raises: InputError when matplotlib is not installed (extra `report`).
     """

@@ -34,7 +34,8 @@ def mirrored(
 ) -> list[Emitters]:
     """Images of M lamps in a rough surface: a halo for each image, and a core for each of its fragments.
 
-    Every fragment is the image in a facet whose slope follows the waves. Source: reflection at a plane; Fresnel's law;
+    The lamps stand at `p_dock` (M, 3) and have `watts` (M, 3) in each band; `index` is that of the water. Every
+    fragment is the image in a facet whose slope follows the waves. Source: reflection at a plane; Fresnel's law;
     slopes: C. Cox, W. Munk, J. Opt. Soc. Am. 44, 1954.
     """
     camera_m = view.T_dock_cam[:3, 3]
@@ -68,7 +69,7 @@ def mirrored(
 
 
 def fresnel(cosine: Array, index: float) -> Array:
-    """Reflectance of the surface seen from below, unpolarised, at the `cosine` of the angle to the vertical."""
+    """Reflectance (N,) of the surface from below, unpolarised, at the `cosine` (N,) of the angle to the vertical."""
     sine2 = (1.0 - cosine**2) * index**2
     out = np.sqrt(np.maximum(1.0 - sine2, 0.0))
     across = ((index * cosine - out) / (index * cosine + out)) ** 2
@@ -79,7 +80,7 @@ def fresnel(cosine: Array, index: float) -> Array:
 def glints(
     knobs: Glints, view: View, station: Station, p_dock: Array, watts: Array, rng: np.random.Generator
 ) -> Emitters:
-    """Reflections on the tube beside each of M lamps, outward from the dock's axis."""
+    """Reflections on the tube beside each of M lamps at `p_dock` (M, 3) with `watts` (M, 3), outward from the axis."""
     outward = p_dock * [1.0, 1.0, 0.0]
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
     before = emission_cosine(p_dock, station.axis, view.T_dock_cam[:3, 3]) > 0.0

@@ -92,7 +92,7 @@ class Canvas:
         self.wide += (photons_sr @ self.colors.qe.T * self.wide_etendue[:, :, None]).astype(np.float32)
 
     def add(self, seen: Emitters, smear_px: Array) -> list[Core | None]:
-        """Draw all emitters; returns the core of each, None where it has none."""
+        """Draw N emitters that move by `smear_px` (N, 2); returns the core of each, None where it has none."""
         cores: list[Core | None] = [None] * len(seen)
         for i in np.flatnonzero(seen.lit):
             direct = seen.at_lens[i] * np.exp(-(self.absorption + self.scattering) * seen.range_m[i])

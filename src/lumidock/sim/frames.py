@@ -72,7 +72,7 @@ class Studio:
 
     @cached_property
     def lamp_sr(self) -> Array | None:
-        """Radiance of the water in the light of the vehicle's own lamp, the same in every frame."""
+        """Radiance (h, w, 3) W/(m2 sr) of the water in the light of the vehicle's own lamp, the same in every frame."""
         lamp = self.scenario.around.headlamp
         return around.headlamp_sr(self.scenario, lamp, self.canvas.wide_rays) if lamp else None
 
@@ -89,7 +89,7 @@ class Studio:
         return Shot(electrons, seen, np.array([self._snr(electrons, core) for core in cores]))
 
     def develop(self, shot: Shot, rng: np.random.Generator) -> np.ndarray:
-        """The picture of a shot, with its noise."""
+        """The picture of a shot, with its noise: (H, W, 3) bgr8, or (H, W) of the other kinds of pixels."""
         return picture(read_out(shot.electrons, self.scenario.sensor, rng), self.scenario.sensor, self.scenario.output)
 
     def _view(self, moment: Moment) -> View:

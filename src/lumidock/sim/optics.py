@@ -68,7 +68,7 @@ def joined(parts: list[Emitters]) -> Emitters:
 
 
 def beam_exponent(beam_deg: Array | float) -> Array:
-    """Exponent n of cos^n, a beam that has half its intensity at half of `beam_deg`."""
+    """Exponent n of cos^n, a beam that has half its intensity at half of `beam_deg`, of any shape."""
     return np.asarray(np.log(0.5) / np.log(np.cos(np.deg2rad(np.minimum(beam_deg, 179.0)) / 2.0)))
 
 

@@ -190,7 +190,7 @@ def _taken(plan: Plan, row: Row) -> tuple[bytes, _Written]:
 
 
 def encoded(image: np.ndarray, output: Output) -> bytes:
-    """The content of a picture's file."""
+    """The content of the file of a picture (H, W[, 3]). Raises: LumidockError when it cannot be encoded."""
     options = [cv2.IMWRITE_JPEG_QUALITY, output.quality] if output.file == "jpg" else _PNG_OPTIONS
     done, content = cv2.imencode(f".{output.file}", image, options)
     if not done:

@@ -69,7 +69,7 @@ def emission_cosine(p_dock: Array, axis: Array, t_dock_cam: Array) -> Array:
 
 
 def dark_lights(scenario: Scenario, front_in_view: Indices, rng: np.random.Generator) -> Indices:
-    """Which of the front lights in view are dark in this frame."""
+    """Indices (k,) of those of the front lights in view that are dark in this frame."""
     count = min(int(rng.integers(*scenario.faults.missing, endpoint=True)), len(front_in_view))
     return np.asarray(rng.choice(front_in_view, count, replace=False)) if count else np.empty(0, np.int64)
 

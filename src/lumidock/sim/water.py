@@ -68,5 +68,5 @@ def green_index(water: Water) -> float:
 
 
 def diffuse_attenuation(a: Array, backscatter: Array) -> Array:
-    """Decay 1/m of daylight with depth: 1.04 (a + bb) over the mean cosine. Source: H. Gordon, L&O 34, 1989."""
+    """Decay (3,) 1/m of daylight with depth: 1.04 (a + bb) over the mean cosine. Source: H. Gordon, L&O 34, 1989."""
     return np.asarray(1.04 * (a + backscatter) / _DOWNWARD_COSINE)

@@ -42,7 +42,7 @@ def read_image(path: Path, encoding: str = "") -> Image:
 
 
 def decode_image(data: bytes, path: object, encoding: str = "") -> Image:
-    """The picture in the bytes of a PNG or JPEG; `path` is what an error calls it. Raises: as `read_image`."""
+    """The picture (H, W[, 3]) in the bytes of a PNG or JPEG, which an error calls `path`. Raises: as `read_image`."""
     width, height = _size_in_header(path, data)
     if not 0 < width * height <= MAX_PIXELS:
         raise _bad(path, f"{width}x{height} pixels")
@@ -60,7 +60,7 @@ def decode_image(data: bytes, path: object, encoding: str = "") -> Image:
 
 
 def full_scale(image: Image, bits: int) -> Image:
-    """A picture whose 16-bit pixels have `bits` that count, stretched to 16; what is beyond them is white."""
+    """A picture (H, W[, 3]) whose 16-bit pixels have `bits` that count, stretched to 16; beyond them is white."""
     if image.dtype != np.uint16 or bits == 16:
         return image
     return np.left_shift(np.minimum(image, np.uint16((1 << bits) - 1)), np.uint16(16 - bits))

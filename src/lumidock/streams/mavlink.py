@@ -84,7 +84,7 @@ def estimate(link: common.MAVLink, fix: Fix, vehicle: Vehicle, resets: int) -> c
 
 
 def roll_pitch_yaw(R: Array) -> tuple[float, float, float]:
-    """Angles of R = Rz(yaw) Ry(pitch) Rx(roll), rad."""
+    """Angles of R (3, 3) = Rz(yaw) Ry(pitch) Rx(roll), rad."""
     pitch = math.asin(max(-1.0, min(1.0, -float(R[2, 0]))))
     return math.atan2(float(R[2, 1]), float(R[2, 2])), pitch, math.atan2(float(R[1, 0]), float(R[0, 0]))
 
