@@ -30,6 +30,9 @@ def test_what_a_file_does_not_name_keeps_its_default(tmp_path):
         "paper: {pso: {scale: [8, 0.5]}}",
         "paper: {btekf: {gate: .nan}}",
         "paper: {extract: {gray: blue}}",
+        "match: {noise_px: 1.0e+300}",
+        "match: {far_m: 1.0e-300}",
+        "track: {start_m_s: 1.0e+300}",
     ],
 )
 def test_refusals_are_one_line_that_names_the_file(tmp_path, text):

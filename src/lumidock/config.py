@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, PositiveInt
 
 from lumidock.yamlfile import read_mapping, validate
 
+PositiveFloat = Annotated[float, Field(ge=1e-12, le=1e9)]  # its square, and one over that, are numbers too
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Hue = Annotated[int, Field(ge=0, le=179)]
 Effort = Annotated[int, Field(ge=1, le=10_000)]
