@@ -11,6 +11,8 @@ import cv2
 
 from lumidock import Frame, Localizer, load_camera, load_station
 
+if len(sys.argv) != 4:
+    sys.exit(__doc__)
 picture, station, camera = map(Path, sys.argv[1:4])
 localizer = Localizer(load_station(station), load_camera(camera))
 fix = localizer.process(Frame(picture.stem, t_ns=0, image=cv2.imread(str(picture))))

@@ -9,6 +9,8 @@ from pathlib import Path
 from lumidock import Frame, Localizer, load_camera, load_station
 from lumidock.streams.sources import open_source
 
+if len(sys.argv) != 4:
+    sys.exit(__doc__)
 video, station, camera = map(Path, sys.argv[1:4])
 localizer = Localizer(load_station(station), load_camera(camera))
 for item in open_source(video).items():

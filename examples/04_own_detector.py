@@ -19,6 +19,8 @@ def spots(image: np.ndarray) -> np.ndarray:
     return cv2.connectedComponentsWithStats(mask)[3][1:]  # the first one is the background
 
 
+if len(sys.argv) != 4:
+    sys.exit(__doc__)
 picture, station, camera = map(Path, sys.argv[1:4])
 localizer = Localizer(load_station(station), load_camera(camera))
 fix = localizer.process_detections(Detections.from_uv(picture.stem, 0, spots(cv2.imread(str(picture)))))

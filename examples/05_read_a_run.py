@@ -11,6 +11,8 @@ import numpy as np
 from lumidock import load_station
 from lumidock.streams.replay import read_fixes
 
+if len(sys.argv) != 2:
+    sys.exit(__doc__)
 run = Path(sys.argv[1])
 fixes = [fix for fix, _, _ in read_fixes(run, load_station(run / "station.yaml").ids)]
 valid = [fix for fix in fixes if fix.valid]
