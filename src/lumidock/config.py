@@ -211,7 +211,7 @@ class MatchConfig(Section):
     max_spots_three: PositiveInt = 14  # among more, three lights of a layer say nothing
     sure: PositiveFloat = 15.0  # log evidence above which three lights of each layer need not be looked for
     margin: PositiveFloat = 6.9  # log odds of the names on one frame, ln 1000
-    margin_gathered: PositiveFloat = 9.2  # over frames, or with three lights; and of each name that one frame proves
+    margin_gathered: PositiveFloat = 9.2  # over frames, or with three lights; of names that one frame alone may prove
     lead: PositiveFloat = 3.5  # log odds by which a naming gathered over frames must lead in the last one alone
     min_layer: PositiveInt = 3  # fewer lights of a second layer stay unnamed without history: they would set the tilt
     enough: PositiveInt = 4  # names that let the doubtful ones be dropped

@@ -94,8 +94,9 @@ class Localizer:
             self.beliefs = followed
             return self._conclude(detections, "tracking")
         self._failures += 1
-        if self.locked and followed and not held and self._failures == 1:
-            return self._coast(detections, self._doubt(followed, seen))  # one in many thousands fails by chance
+        doubt = self._doubt(followed, seen)
+        if self.locked and doubt == "residual" and not held and self._failures == 1:
+            return self._coast(detections, doubt)  # one in many thousands fails by chance
         found = self._acquire(detections, seen)
         if held and not track.is_joint(
             verify.names_of(found, self.config.match, len(self.station)), self._plan, self.config.track
@@ -108,7 +109,7 @@ class Localizer:
         if verify.is_answer(found, self.config.match) and self._lock(found, detections, seen, held_still):
             return self._conclude(detections, "acquired")
         if self.locked:
-            return self._coast(detections, self._doubt(followed, seen) or _why(detections, found))
+            return self._coast(detections, doubt or _why(detections, found))
         if not self.cold and self._gather(followed, found, detections, seen):
             return self._conclude(detections, "acquired")
         return self._no_fix(detections, "none", _why(detections, found))
@@ -131,8 +132,8 @@ class Localizer:
     def _follow(self, beliefs: list[Track], seen: Spots) -> list[Track]:
         """The beliefs that find lights in this frame, with these taken in, the likeliest first.
 
-        One whose pose does not settle cannot be judged, and the others must not win for want of it: before a lock it is
-        kept as it was predicted; after one, where it is as likely as the others, none is followed.
+        One whose pose does not settle cannot be judged, and the others must not win for want of it: it is kept as it
+        was predicted. A lock follows none that is first.
         """
         followed, unjudged = [], []
         for belief in beliefs:
@@ -147,11 +148,8 @@ class Localizer:
                 unjudged.append(replace(weighed, name=found.name))
             else:
                 followed.append(updated)
-        if not self.locked:
-            return self._likeliest([*followed, *unjudged])
-        kept = self._likeliest(followed)
-        lost = max((belief.log_weight for belief in unjudged), default=-math.inf)
-        return kept if kept and kept[0].log_weight - lost > self.config.track.forget else []
+        kept = self._likeliest([*followed, *unjudged])
+        return [] if self.locked and kept and kept[0] in unjudged else kept
 
     def _likeliest(self, beliefs: list[Track]) -> list[Track]:
         """The likeliest first, without those that are out of the question or the same as a likelier one."""

@@ -81,7 +81,7 @@ class Acquisition:
     """The best hypothesis first, without its doubtful names, and all that fit, with them.
 
     `margin` is the log odds of its names against all others; `certainty` what of it may stand for the stated risk: less
-    among spots that crowd around them, and no more than a lock needs where one name alone is in doubt.
+    among spots that crowd around them, and no more than a lock needs where too few names are each beyond doubt.
     `others` are the other poses that the best names fit, where a plane leaves two. `reason` says why it is no answer.
     """
 
@@ -375,8 +375,8 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
     reason = "mirror" if mirror > max(best - config.margin, direct) else "ambiguous"
     same = tuple(Hypothesis(kept, T_cam_dock, score) for T_cam_dock, score in others)
     margin = best - against
-    doubtful = bool((odds[kept >= 0] < config.margin_gathered).any())
-    certainty = min(margin - (crowding if strays else 0.0), config.margin if doubtful else math.inf)
+    rests = int((odds[kept >= 0] > config.margin_gathered).sum()) >= config.enough
+    certainty = min(margin - (crowding if strays else 0.0), math.inf if rests else config.margin)
     return Acquisition((head, *rest), same, margin, reason, certainty)
 
 
