@@ -11,7 +11,8 @@ from lumidock.datatypes import Array, Image, Indices
 
 FILTER_PX = 1.2  # width of the window that judges a small spot ...
 _FILTERED_PX = 3.0  # ... up to this radius
-_GRID, _GRID_OF_MOSAIC = 0.015, 0.05  # 1 sigma, of a sample's side, that the grid of samples leaves to a balance
+_GRID, _GRID_OF_MOSAIC = 0.015, 0.05  # 1 sigma, of a sample's side, that the grid leaves to a small spot's balance
+_WIDTHS = 3  # times the width of what stands over the noise, from which a fit is tried: faint flanks are not seen
 _FINE_MARK, _SKEW_MARK = 100, 101  # of regions grown again, beside those of the levels tried
 
 
@@ -52,7 +53,7 @@ def describe(
     center, cov = np.empty(2), np.empty(3)
     variance = noise**2 + q[fields.SIGNAL_NOISE] * max(sums[patch.W] / sums[patch.N], 0.0)
     unit = where[patch.UNIT]
-    patch.balance(sums, variance * shared, center, cov)
+    patch.balance(sums, variance * _averaging(ground[4], radius), center, cov)
     shift_u, shift_v = _plane_shift(image, planes, scale, weight, window, where, start, level)
     center[0] = where[patch.LEFT] + unit * (start[0] + center[0]) + shift_u
     center[1] = where[patch.TOP] + unit * (start[1] + center[1]) + shift_v
@@ -62,30 +63,35 @@ def describe(
         other_u, other_v = _plane_shift(image, planes, scale, weight, window, where, start, higher)
         skew_u, skew_v = skew_u + other_u - shift_u, skew_v + other_v - shift_v
     noise_of_balance = unit * unit * (cov[0] + cov[2] + 2.0 * (_GRID_OF_MOSAIC if planes == 4 else _GRID) ** 2)
+    # half of it along the skew, half of it any way: a grid skews a spot one way and displaces it another
+    astray = 0.25 * (skew_u * skew_u + skew_v * skew_v) + (q[fields.SATURATED_PX] * unit) ** 2 * unit / radius
     cov[0], cov[1], cov[2] = (
-        unit * unit * cov[0] + skew_u * skew_u,
-        unit * unit * cov[1] + skew_u * skew_v,
-        unit * unit * cov[2] + skew_v * skew_v,
+        unit * unit * cov[0] + 0.5 * skew_u * skew_u + astray,
+        unit * unit * cov[1] + 0.5 * skew_u * skew_v,
+        unit * unit * cov[2] + 0.5 * skew_v * skew_v + astray,
     )
     if radius <= q[fields.SMALL_PX] * (1.6 if planes == 4 else 1.0) and sums[patch.EDGE] == 0.0:
         sample_noise = noise if planes < 4 else max(noise / np.sqrt((weight**2).sum()), q[fields.MIN_NOISE])
         balanced = center[0], center[1]
-        width = gauss.fit(
-            image,
-            planes,
-            scale,
-            weight,
-            slope,
-            center,
-            max(radius / 1.18, 0.8),
-            sample_noise,
-            q[fields.SIGNAL_NOISE],
-            q[fields.CLIPPED],
-            cov,
-        )
+        width = 0.0
+        for wider in range(_WIDTHS):
+            if width == 0.0:
+                width = gauss.fit(
+                    image,
+                    planes,
+                    scale,
+                    weight,
+                    slope,
+                    center,
+                    max(radius / 1.18, 0.8) * (1.0 + wider),
+                    sample_noise,
+                    q[fields.SIGNAL_NOISE],
+                    q[fields.CLIPPED],
+                    cov,
+                )
         if width > 0.0:
             merged = _disagreement(center[0] - balanced[0], center[1] - balanced[1], noise_of_balance)
-            cov *= shared
+            cov *= _averaging(ground[4], width)
             spot[fields.RADIUS] = 1.18 * width
     spot[fields.U], spot[fields.V] = center
     floor = _floor(planes, weight, spot, sums, q) + (q[fields.TEXTURE] * ground[3] * radius / (top - ground[0])) ** 2
@@ -93,6 +99,15 @@ def describe(
     spot[fields.VAR_UV] = cov[1] + merged[1]
     spot[fields.VAR_VV] = cov[2] + floor + merged[2]
     return not _is_known(spots, n)
+
+
+@njit(cache=True)
+def _averaging(shared: float, width: float) -> float:
+    """Variance of a centre by noise that neighbours share, over that by as much noise of each sample on its own.
+
+    Of a Gaussian spot of `width` px, 1 sigma, in noise of a Gaussian spectrum; a wide region has `shared` times it.
+    """
+    return shared / (1.0 + (shared - 1.0) / (4.0 * np.pi * width * width)) ** 2
 
 
 @njit(cache=True)
@@ -119,9 +134,9 @@ def _size(
 def _floor(planes: int, weight: Array, spot: Array, sums: Array, q: Array) -> float:
     """Variance of a centre that has no noise."""
     coarse = planes == 3 and weight[1] < max(weight[0], weight[2])
-    variance = (q[fields.COARSE_PX] if coarse else q[fields.FLOOR_PX]) ** 2
-    if spot[fields.SATURATED] > 0.0:
-        variance += q[fields.SATURATED_PX] ** 2
+    variance = q[fields.FLOOR_PX] ** 2
+    if coarse:  # along a longer outline the error of a sample averages out
+        variance = (q[fields.COARSE_PX] * min(q[fields.SMALL_PX] / spot[fields.RADIUS], 1.0)) ** 2
     if sums[patch.EDGE] > 0.0:
         variance += (q[fields.CUT_SHARE] * spot[fields.RADIUS]) ** 2
     return float(variance)

@@ -8,7 +8,9 @@ from numba import njit
 from lumidock.datatypes import Array, Image
 
 _ROUNDS, _REACH = 6, 9
-_PRIOR_DOF = 20.0  # how much the expected noise counts beside the residuals of a fit
+_PRIOR_DOF = 6.0  # how much the expected noise counts beside the residuals of a fit
+_PROFILE = 0.05  # share of the signal by which a spot's profile is no Gaussian
+_FITTED = 2.0  # of the residuals' degrees of freedom, that the position takes up
 
 
 @njit(cache=True)
@@ -74,7 +76,7 @@ def fit(
     if not solved:
         return 0.0
     center[0], center[1] = u, v
-    misfit = _odd_misfit(z, ex, ey, left, top, parts, noise, signal_noise, amplitude, u, v)
+    misfit = _misfit(z, (ex, ey), (u - left, v - top), (left, top), s, parts, noise, signal_noise, amplitude, ground)
     cov[0], cov[1], cov[2] = inverse[0] * misfit, inverse[1] * misfit, inverse[2] * misfit
     return s
 
@@ -109,36 +111,57 @@ def _read(
 
 
 @njit(cache=True)
-def _odd_misfit(
+def _misfit(
     z: Array,
-    ex: Array,
-    ey: Array,
-    left: int,
-    top: int,
+    profile: tuple[Array, Array],
+    center: tuple[float, float],
+    corner: tuple[int, int],
+    s: float,
     parts: int,
     noise: float,
     signal_noise: float,
     amplitude: Array,
-    u: float,
-    v: float,
+    ground: Array,
 ) -> float:
-    """How much more the residuals differ between opposite sides than noise would: what is even displaces nothing."""
-    center_i, center_j = int(np.floor(v + 0.5)) - top, int(np.floor(u + 0.5)) - left
-    total, pairs = 0.0, 0
-    for i in range(center_i + 1):
-        for j in range(len(ex)):
-            k, m = 2 * center_i - i, 2 * center_j - j
-            if not (i < k or j < m) or k >= len(ey) or m < 0 or m >= len(ex):
+    """How much larger the residuals are than noise, counted where they move the centre; `z` becomes the residuals.
+
+    What is even about the centre displaces nothing: opposite residuals are compared, and a share of the signal is
+    allowed for, as no lens draws a Gaussian and no grid holds one evenly. Where saturated samples are left out there is
+    no such balance, and every residual counts.
+    """
+    (ex, ey), whole = profile, True
+    var, info, signal = np.empty(z.shape), np.empty(z.shape), np.empty(z.shape)
+    for i in range(len(z)):
+        b = ((i - center[1]) / s) ** 2
+        for j in range(z.shape[1]):
+            p = ((corner[1] + i) & 1) * 2 + ((corner[0] + j) & 1) if parts == 4 else 0
+            g = amplitude[p] * ex[j] * ey[i]
+            z[i, j] -= ground[p] + g
+            var[i, j] = noise * noise + signal_noise * max(g, 0.0)
+            info[i, j] = g * g * (((j - center[0]) / s) ** 2 + b) / var[i, j]
+            whole &= not np.isnan(z[i, j])
+            signal[i, j] = g
+    allowed = (_PROFILE * signal) ** 2 if whole else np.zeros(z.shape)
+    middle_j, middle_i = int(np.floor(center[0] + 0.5)), int(np.floor(center[1] + 0.5))
+    total, weight, square, least = 0.0, 0.0, 0.0, 0.0
+    for i in range(len(z)):
+        for j in range(z.shape[1]):
+            k, m = 2 * middle_i - i, 2 * middle_j - j
+            if whole and (not (i < k or (i == k and j < m)) or k >= len(z) or m < 0 or m >= z.shape[1]):
                 continue
-            a, b = z[i, j], z[k, m]
-            if np.isnan(a) or np.isnan(b):
-                continue
-            p = ((top + i) & 1) * 2 + ((left + j) & 1) if parts == 4 else 0
-            g, h = amplitude[p] * ex[j] * ey[i], amplitude[p] * ex[m] * ey[k]
-            odd = a - g - b + h
-            total += odd * odd / (2.0 * noise * noise + signal_noise * (max(g, 0.0) + max(h, 0.0)))
-            pairs += 1
-    return (_PRIOR_DOF + total) / (_PRIOR_DOF + pairs)
+            odd, share, expected, profile_var = z[i, j], info[i, j], var[i, j], allowed[i, j]
+            if whole:
+                odd, share, expected = odd - z[k, m], share + info[k, m], expected + var[k, m]
+                profile_var += allowed[k, m]
+            if not np.isnan(odd):
+                total += share * odd * odd / (expected + profile_var)
+                least += share * profile_var / (expected + profile_var)
+                weight += share
+                square += share * share
+    if weight <= 0.0:
+        return 1.0
+    dof = weight * weight / square
+    return max((_PRIOR_DOF + dof * total / weight) / (_PRIOR_DOF + max(dof - _FITTED, 0.0)), least / weight)
 
 
 @njit(cache=True)

@@ -14,6 +14,7 @@ LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out
 _MAX_TILES = 20  # a light is not wider
 _ROUNDS = 4
 _QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth having clears 1.8
+_MOST_SHARED = 36.0  # samples over which noise is the same; more is a texture
 _LEAST_STEP = 30.0  # levels by which a saturated light stands out in the plane that shows it best
 
 
@@ -54,15 +55,16 @@ def measure(
     shared = (weight**2 * shared_by_plane).sum() / (weight**2).sum()
     expected = noise * np.sqrt((weight**2).sum())
     reach = min(max(3.5 * radius, 1.5 * q[fields.RING_PX]), 3.5 * q[fields.MAX_RADIUS_PX])
-    part, ground = 0.0, np.zeros(4)  # of the surroundings: level, noise, texture that hides a spot, texture at all
+    # of the surroundings: level, noise, texture that hides a spot, texture that moves it, and how far noise is shared
+    part, ground = 0.0, np.zeros(5)
     for turn in range(_ROUNDS):
         patch.cut(image, planes, scale, weight, v, u, reach, patch.COARSE_SIDE, window[0], where)
         start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
         ring = 0.9 * reach / where[patch.UNIT]
-        ground[0], spread = patch.flatten(window[0], where, float(start[0]), float(start[1]), ring)
+        ground[0], spread, uneven = patch.flatten(window[0], where, float(start[0]), float(start[1]), ring)
         ground[1] = max(patch.rim_noise(window[0], where), 0.5 * expected, q[fields.MIN_NOISE] * expected / noise)
-        ground[3] = np.sqrt(max(spread**2 - 2.0 * ground[1] ** 2, 0.0))
-        ground[2] = 0.0 if clipped else ground[3]
+        ground[2] = 0.0 if clipped else np.sqrt(max(spread**2 - 2.0 * ground[1] ** 2, 0.0))
+        ground[3] = np.sqrt(max(uneven**2 - 2.0 * ground[1] ** 2, 0.0))
         if turn == 0 and not clipped:
             width = max(FILTER_PX / where[patch.UNIT], 0.7)
             if (
@@ -91,6 +93,9 @@ def measure(
     if part == 0.0:
         return 0
     _own(seen, window[1], where, start)
+    ground[4] = (weight**2 * shared_by_plane**2).sum() / (weight**2).sum()
+    if planes == 3:  # in the sum of channels fine noise is what JPEG leaves, and coarse noise that of the sensor
+        ground[4] = min(max(ground[4] * (expected / ground[1]) ** 2, 1.0), _MOST_SHARED)
     spots[n, fields.CORE] = 0.0
     for p in range(planes):
         spots[n, fields.CORE] += samples.core_mean(image, planes, scale, p, v, u) / planes

@@ -15,6 +15,7 @@ from lumidock.datatypes import Array, Image
 
 COARSE_SIDE, SIDE = 32, 48  # samples a side of the window that finds a spot's level, and of the one that measures it
 ROOM = SIDE + 16
+_ROOT_TWO = np.sqrt(2.0)
 # entries of `sums`, see `grow`; weights w are over the level
 N, X, Y, XX, XY, YY, W, WX, WY, CLIPPED, EDGE, OPEN = range(12)
 # the window's geometry, see `cut`
@@ -71,11 +72,12 @@ def cut(
 
 
 @njit(cache=True)
-def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tuple[float, float]:
-    """Level and spread (1 sigma) of the ring of `radius` around a sample, whose slope is taken out of the patch.
+def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tuple[float, float, float]:
+    """Level, spread and unevenness (1 sigma) of the ring of `radius` around a sample, without its slope.
 
-    The slope is what a neighbour's halo adds: by least squares, from opposite samples within Tukey's fences. The level
-    is the mean of the middle half, the spread from the quartiles.
+    The slope, which is taken out of the patch, is what a neighbour's halo adds: by least squares, from opposite samples
+    within Tukey's fences. The level is the mean of the middle half, the spread from the quartiles. The unevenness is
+    the spread of what opposite samples differ by: what bends alike on either side displaces nothing.
     """
     columns, rows = int(where[COLUMNS]), int(where[ROWS])
     values, ordered = np.empty(RING), np.empty(RING)
@@ -87,7 +89,7 @@ def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tu
             values[k] = patch[b, a]
             count = insert(ordered, count, patch[b, a])
     if count == 0:
-        return 0.0, 0.0
+        return 0.0, 0.0, 0.0
     quarter = count // 4
     low, high = ordered[quarter], ordered[count - 1 - quarter]
     fence = 1.5 * (high - low)
@@ -100,20 +102,26 @@ def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tu
             gy += (a - b) * SIN[k]
             opposite += 1
     if opposite < RING // 3:
-        return ordered[quarter : count - quarter].mean(), (high - low) / 1.35
+        spread = (high - low) / 1.35
+        return ordered[quarter : count - quarter].mean(), spread, spread
     gx, gy = gx / opposite, gy / opposite
     count = 0
     for k in range(RING):
         if not np.isnan(values[k]):
             count = insert(ordered, count, values[k] - gx * COS[k] - gy * SIN[k])
     level, spread = ordered[quarter : count - quarter].mean(), (ordered[count - 1 - quarter] - ordered[quarter]) / 1.35
+    uneven, pairs = np.empty(RING // 2), 0
+    for k in range(RING // 2):
+        odd = abs(0.5 * (values[k] - values[k + RING // 2]) - gx * COS[k] - gy * SIN[k])
+        if not np.isnan(odd):
+            pairs = insert(uneven, pairs, odd)
     gx, gy = gx / radius, gy / radius
     if max(abs(gx), abs(gy)) * radius > 0.3 * spread:
         where[SLOPE_U], where[SLOPE_V] = gx / where[UNIT], gy / where[UNIT]
         for i in range(rows):
             for j in range(columns):
                 patch[i, j] -= gx * (j - x) + gy * (i - y)
-    return level, spread
+    return level, spread, _ROOT_TWO * uneven[pairs // 2] / 0.674
 
 
 @njit(cache=True)
