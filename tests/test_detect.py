@@ -433,3 +433,68 @@ def test_no_frame_takes_long(blobs, rng):
         times[name] = np.median(runs)
         assert len(spots) <= CONFIG.max_spots
     assert times["crowded"] < 20.0 * times["easy"]
+
+
+@pytest.mark.parametrize("kind", ["mono8", "mono16", *(f"{order}8" for order in MOSAICS)])
+def test_a_bad_pixel_is_no_lamp_and_the_sharpest_spot_of_a_lens_is_one(kind, rng):
+    image = canvas(rng, (400, 480))
+    lamps, bad = rng.uniform(40.0, 360.0, (4, 2)), rng.integers(40, 360, (8, 2))
+    for k, (u, v) in enumerate(lamps):
+        lamps[k] = 60.0 + 100.0 * k + u / 40.0, 60.0 + v / 40.0
+        add_spot(image, *lamps[k], peak=90.0, sigma=0.7)
+    for k, (u, v) in enumerate(bad):
+        bad[k] = 40 + 55 * k + u % 4, 200 + v % 4
+        image[bad[k, 1], bad[k, 0]] += rng.uniform(40.0, 200.0)
+    spots = detect.lights(as_format(image, kind), CONFIG)
+    distance = np.linalg.norm(spots.uv[:, None] - np.concatenate([lamps, bad])[None], axis=2)
+    near = np.where(distance.min(axis=1) < 1.5, distance.argmin(axis=1), -1)
+    assert set(near[spots.p_light > 0.5]) == {0, 1, 2, 3}
+    assert spots.p_light[near >= 4].max(initial=0.0) < 0.1
+
+
+@pytest.mark.parametrize("way", [(6.0, 0.0), (3.0, 3.0)])
+def test_a_light_between_the_fields_of_interlaced_video_is_unsure_along_its_way(way, rng):
+    fields = []
+    for share in (-0.5, 0.5):
+        image = canvas(rng, (200, 200))
+        add_spot(image, 100.3 + share * way[0], 100.6 + share * way[1], peak=180.0, sigma=4.0)
+        fields.append(image)
+    woven = fields[0].copy()
+    woven[1::2] = fields[1][1::2]
+    still, moving = found(fields[0]), found(woven)
+    k = np.argmin(np.linalg.norm(moving.uv - (100.3, 100.6), axis=1))
+    along = np.array(way) / np.hypot(*way)
+    before, after = (np.sqrt(along @ cov @ along) for cov in (still.cov_px2[0], moving.cov_px2[k]))
+    assert after > 4.0 * before
+    assert 0.5 < after / (np.hypot(*way) / np.sqrt(12.0)) < 2.0
+
+
+def test_covariances_hold_in_noise_that_neighbours_share(rng):
+    """As after demosaicing: every sample is an average of four, and noise averages out less than that of any one."""
+    nees = []
+    for _ in range(8):
+        noise = rng.normal(0.0, 3.0, (401, 401))
+        image = 60.0 + 0.5 * (noise[1:, 1:] + noise[:-1, 1:] + noise[1:, :-1] + noise[:-1, :-1])
+        places = 70.0 + 130.0 * np.stack(np.divmod(np.arange(9), 3), axis=1) + rng.uniform(-0.5, 0.5, (9, 2))
+        for u, v in places:
+            add_spot(image, u, v, peak=60.0, sigma=1.3)
+        spots = found(image, DetectConfig(floor_px=1e-3, signal_noise=1e-9))
+        for place in places:
+            k = np.argmin(np.linalg.norm(spots.uv - place, axis=1))
+            error = spots.uv[k] - place
+            nees.append(error @ np.linalg.solve(spots.cov_px2[k], error) / 2.0)
+    assert 0.6 < np.mean(np.sort(nees)[:-1]) < 1.45
+
+
+def test_a_faint_wide_light_is_as_unsure_as_it_is_wrong(rng):
+    nees = []
+    for _ in range(6):
+        image, place = canvas(rng, (300, 300), noise=2.0), rng.uniform(140.0, 160.0, 2)
+        add_spot(image, *place, peak=7.0, sigma=2.5)
+        spots = found(image, DetectConfig(floor_px=1e-3))
+        if len(spots):
+            error = spots.uv[np.linalg.norm(spots.uv - place, axis=1).argmin()] - place
+            k = np.linalg.norm(spots.uv - place, axis=1).argmin()
+            nees.append(error @ np.linalg.solve(spots.cov_px2[k], error) / 2.0)
+    assert len(nees) >= 3
+    assert np.median(nees) < 3.0

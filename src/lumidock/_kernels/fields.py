@@ -5,10 +5,26 @@ Lengths in pixels, values in 8-bit grey levels.
 
 from __future__ import annotations
 
-U, V, RADIUS, FLUX, SNR, ELONGATION, FILL, LEVEL, SATURATED, CUT, HALO, CORE, P_LIGHT, VAR_UU, VAR_UV, VAR_VV = range(
-    16
-)
-COLUMNS = 16
+(
+    U,
+    V,
+    RADIUS,
+    FLUX,
+    SNR,
+    ELONGATION,
+    FILL,
+    LEVEL,
+    SATURATED,
+    CUT,
+    HALO,
+    CORE,
+    P_LIGHT,
+    VAR_UU,
+    VAR_UV,
+    VAR_VV,
+    BY_LENS,
+) = range(17)
+COLUMNS = 17
 # what may be tuned, see `DetectConfig`
 (
     CONTRAST,

@@ -8,10 +8,12 @@ from numba import njit
 from lumidock._kernels import fields
 from lumidock.datatypes import Array
 
+_LOG_BAD_PIXEL = -2.3  # prior log odds that a small spot is a bad pixel
+
 
 @njit(cache=True)
 def lamp_probability(spot: Array, q: Array) -> float:
-    """Probability of being a lamp, from contrast, shape and size: soft, so that geometry can overrule it."""
+    """Probability of being a lamp, from contrast, shape, size and blur: soft, so that geometry can overrule it."""
     radius = spot[fields.RADIUS]
     seen = _logistic(spot[fields.SNR] - 8.5)
     small = np.exp(-radius / 3.0)  # the outline of a small spot says little of its shape
@@ -22,7 +24,8 @@ def lamp_probability(spot: Array, q: Array) -> float:
     size = _logistic((0.5 * largest - radius) / (0.1 * largest)) * _logistic((radius - q[fields.MIN_RADIUS_PX]) / 0.1)
     usual = 0.7 if spot[fields.SATURATED] > 0.0 else 0.5
     alone = 1.0 - 2.0 * max(spot[fields.LEVEL] - usual, 0.0)
-    return float(min(max(seen * shape * size * alone, 0.02), 0.98))
+    blurred = _logistic(min(spot[fields.BY_LENS], 50.0) - _LOG_BAD_PIXEL)
+    return float(min(max(seen * shape * size * alone * blurred, 0.02), 0.98))
 
 
 @njit(cache=True)

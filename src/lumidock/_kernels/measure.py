@@ -14,6 +14,9 @@ LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out
 _MAX_TILES = 20  # a light is not wider
 _ROUNDS = 4
 _QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth having clears 1.8
+# share of a peak's height that a lens that blurs by 0.65 px, 1 sigma, gives the pixels around it; on a mosaic those of
+# other colours get a quarter of it from a lamp of one colour
+_AROUND, _AROUND_OF_MOSAIC = 0.24, 0.06
 _MOST_SHARED = 36.0  # samples over which noise is the same; more is a texture
 _LEAST_STEP = 30.0  # levels by which a saturated light stands out in the plane that shows it best
 
@@ -97,8 +100,14 @@ def measure(
     if planes == 3:  # in the sum of channels fine noise is what JPEG leaves, and coarse noise that of the sensor
         ground[4] = min(max(ground[4] * (expected / ground[1]) ** 2, 1.0), _MOST_SHARED)
     spots[n, fields.CORE] = 0.0
-    for p in range(planes):
-        spots[n, fields.CORE] += samples.core_mean(image, planes, scale, p, v, u) / planes
+    for k in range(planes):
+        spots[n, fields.CORE] += samples.core_mean(image, planes, scale, k, v, u) / planes
+    spots[n, fields.BY_LENS] = np.inf
+    if planes != 3 and not clipped and radius <= tiles.TILE_PX:  # colour is spread by demosaicing, by the lens or not
+        share = _AROUND if planes == 1 else _AROUND_OF_MOSAIC
+        spots[n, fields.BY_LENS] = samples.log_lens_over_bad_pixel(
+            image, planes, scale, v, u, q[fields.RING_PX], share, noise
+        )
     return int(describe(image, planes, scale, weight, window, where, start, u, v, part, ground, shared, q, spots, n))
 
 

@@ -11,11 +11,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lumidock._kernels.samples import COS, RING, SIN, insert
-from lumidock.datatypes import Array, Image
+from lumidock.datatypes import Array, Image, Indices
 
 COARSE_SIDE, SIDE = 32, 48  # samples a side of the window that finds a spot's level, and of the one that measures it
 ROOM = SIDE + 16
 _ROOT_TWO = np.sqrt(2.0)
+_LEAST_ROWS = 4.0  # of a field
 # entries of `sums`, see `grow`; weights w are over the level
 N, X, Y, XX, XY, YY, W, WX, WY, CLIPPED, EDGE, OPEN = range(12)
 # the window's geometry, see `cut`
@@ -218,6 +219,30 @@ def grow(window: Window, where: Array, image: Image, x: int, y: int, level: floa
                 stamp[d, c] = mark
                 stack[top, 0], stack[top, 1] = c, d
                 top += 1
+
+
+@njit(cache=True)
+def fields_apart(window: Window, where: Array, start: Indices, level: float) -> tuple[float, float]:
+    """How far the centre by even rows lies from that by odd rows, px: the way between the fields of interlaced video.
+
+    Of the region grown last, around `start`; nothing where rows are left out, or a field has too few.
+    """
+    patch, stamp, mark = window[0], window[1], window[1][start[1], start[0]]
+    if where[UNIT] > 1.0:
+        return 0.0, 0.0
+    total, rows = np.zeros((2, 3)), np.zeros(2)
+    for i in range(int(where[ROWS])):
+        k, before = i & 1, total[i & 1, 0]
+        for j in range(int(where[COLUMNS])):
+            if stamp[i, j] == mark:
+                w = patch[i, j] - level
+                total[k, 0] += w
+                total[k, 1] += w * (j - start[0])
+                total[k, 2] += w * (i - start[1])
+        rows[k] += total[k, 0] > before
+    if min(rows[0], rows[1]) < _LEAST_ROWS:
+        return 0.0, 0.0
+    return total[0, 1] / total[0, 0] - total[1, 1] / total[1, 0], total[0, 2] / total[0, 0] - total[1, 2] / total[1, 0]
 
 
 @njit(cache=True)

@@ -55,6 +55,31 @@ def ring_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int, r
 
 
 @njit(cache=True)
+def log_lens_over_bad_pixel(
+    image: Image, planes: int, scale: float, v: int, u: int, radius: float, share: float, noise: float
+) -> float:
+    """Log likelihood ratio of a spot that a lens has drawn over a bad pixel, from the eight pixels around a peak.
+
+    They hold `share` of its height on the average, or nothing, over the ring of `radius`; each counts by its own plane.
+    """
+    if min(u, v) < 1 or u + 1 >= image.shape[1] or v + 1 >= len(image):
+        return np.inf
+    ground = np.zeros(4)
+    for p in range(planes):
+        ground[p] = ring_mean(image, planes, scale, p, v, u, radius)
+    around, height = 0.0, 0.0
+    for y in range(v - 1, v + 2):
+        for x in range(u - 1, u + 2):
+            over = scale * image[y, x, 0] - ground[((y & 1) * 2 + (x & 1)) if planes == 4 else 0]
+            if y == v and x == u:
+                height = over
+            else:
+                around += over / 8.0
+    held = share * height
+    return held * (around - 0.5 * held) * 8.0 / noise**2
+
+
+@njit(cache=True)
 def stands_out(
     image: Image,
     planes: int,
