@@ -21,6 +21,7 @@ _SCENARIOS = ("approach", "water-1c", "shallow", "headlamp", "fouling", "pool", 
 _SEED, _INTERVAL_S = 7001, 0.75
 _NEAR_PX, _SAME_PX = 2.5, 6.0
 _SNRS = (8.0, 12.0, 50.0)
+_FEW = 10  # lights of a kind that say too little
 Rows = dict[str, list[dict[str, str]]]
 
 
@@ -131,4 +132,17 @@ def main() -> tuple[dict[str, object], list[str]]:
     for scenario, figures in content.items():
         assert isinstance(figures, dict)
         lines.append(f"| {scenario} | " + " | ".join(f"{figures[c]:.2f}" for c in columns) + " |")
+    kinds = [f"{color} {kind}" for color in ("white", "blue") for kind in ("saturated", ">50", "20-50", "<20")]
+    lines += ["", "| centres, px rms (NEES / 2, its median / 1.39) | " + " | ".join(kinds) + " |"]
+    lines.append("|---" * (len(kinds) + 1) + "|")
+    for scenario, figures in content.items():
+        assert isinstance(figures, dict)
+        lines.append(f"| {scenario} | " + " | ".join(_centres(figures, kind) for kind in kinds) + " |")
     return content, lines
+
+
+def _centres(figures: dict[str, float], kind: str) -> str:
+    if figures.get(f"{kind}: n", 0) < _FEW:
+        return ""
+    rms, nees, median = (figures[f"{kind}: {name}"] for name in ("rms", "nees/2", "med nees"))
+    return f"{rms:.2f} ({nees:.2f}, {median:.2f})"

@@ -13,6 +13,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -20,11 +21,12 @@ import cv2
 import numpy as np
 
 from bench.shipped import shipped_camera, shipped_station
-from lumidock import detect, layers
+from lumidock import detect, layers, match
 from lumidock.config import Config
-from lumidock.datatypes import Frame
+from lumidock.datatypes import Detections, Frame
 from lumidock.localizer import Localizer
 from lumidock.paper import PaperLocalizer
+from lumidock.station import Station
 from lumidock.streams.sources import open_source
 
 _Z_M, _ROUNDS, _SEED = (18.0, 9.0, 2.3), 7, 7100
@@ -110,6 +112,54 @@ def growth(spurious: tuple[int, ...]) -> dict[str, float]:
     return found
 
 
+def matching_growth(lights: tuple[int, ...], spurious: tuple[int, ...]) -> dict[str, tuple[float, float]]:
+    """Median and largest ms of naming one frame without history, by lights and spurious spots; some are dark.
+
+    The lights stand anywhere on two planes 5 m apart, as many on either, and are seen from 9 m without colour.
+    """
+    rng, camera, config, grown = np.random.default_rng(_SEED), shipped_camera(), Config(), {}
+    for m in lights:
+        station = dense_station(m, rng)
+        plan, expected = match.plan(station, camera, config.match), match.prior(None, config.prior)
+        uv = camera.project(station.p_dock * (1.0, -1.0, -1.0) + (0.2, 0.1, 9.0))
+        for count in spurious:
+            times: Times = defaultdict(list)
+            for turn in range(_DRAWS + 1):
+                shown = (uv + rng.normal(0.0, 0.3, (m, 2)))[rng.random(m) < 0.9]
+                strays = rng.uniform((0.0, 0.0), (camera.width, camera.height), (count, 2))
+                found = match.spots(Detections.from_uv("0", 0, np.concatenate([shown, strays])), plan, config.match)
+                timed(
+                    times if turn else defaultdict(list),
+                    "match",
+                    lambda f=found, p=plan, e=expected: match.acquire(f, p, camera, e, config.match),
+                )
+            grown[f"{m} lights, {count} spurious"] = float(np.median(times["match"])), max(times["match"])
+    return grown
+
+
+def dense_station(lights: int, rng: np.random.Generator) -> Station:
+    """A dock of so many lights at random, 0.15 m apart at least, on two planes of 2 x 2 m."""
+    p: list[np.ndarray] = []
+    while len(p) < lights:
+        place = np.array([*rng.uniform(-1.0, 1.0, 2), -5.0 * (len(p) % 2)])
+        if all(np.linalg.norm(place - other) > 0.15 for other in p):
+            p.append(place)
+    one = shipped_station()
+    return replace(
+        one,
+        name=f"random-{lights}",
+        ids=tuple(f"L{k}" for k in range(lights)),
+        layers=("front", "rear"),
+        layer=np.arange(lights) % 2,
+        p_dock=np.array(p),
+        color=("white",) * lights,
+        axis=np.tile([0.0, 0.0, 1.0], (lights, 1)),
+        beam_deg=np.full(lights, 120.0),
+        power_w=np.full(lights, 2.0),
+    )
+
+
+_DRAWS = 9
 _BLOB = np.exp(-0.5 * (np.arange(-3, 4)[:, None] ** 2 + np.arange(-3, 4)[None] ** 2) / 1.5**2)
 
 _START = """
@@ -169,9 +219,12 @@ def main() -> tuple[dict[str, object], list[str]]:
             content[f"{kind}: {job}"] = medians
             lines.append(f"| {kind}: {job} | " + " | ".join(f"{m:.2f} ({m / one_pass:.1f})" for m in medians) + " |")
     content["growth_ms"] = grown = growth((2, 20, 200))
+    content["matching_ms"] = named = matching_growth((7, 13, 25, 50), (0, 2, 10, 50))
     cold_s, warm_s, peak = start_up(frames[9.0, "bgr8"][0])
     content |= {"start_cold_s": cold_s, "start_warm_s": warm_s, "peak_mib": peak, "machine": machine()}
     lines += ["", "Full search of a mono frame, ms: " + ", ".join(f"{k} {v:.2f}" for k, v in grown.items()) + "."]
+    lines.append("Naming a frame without history, ms, median and largest:")
+    lines[-1] += " " + ", ".join(f"{k} {a:.2f} / {b:.2f}" for k, (a, b) in named.items()) + "."
     lines.append(
         f"Start to the third frame: {cold_s:.1f} s while compiling, {warm_s:.2f} s after; peak memory {peak:.0f} MiB."
     )
