@@ -67,12 +67,13 @@ def describe(
         other_u, other_v = _plane_shift(image, planes, scale, weight, window, where, start, higher)
         skew_u, skew_v = skew_u + other_u - shift_u, skew_v + other_v - shift_v
     noise_of_balance = unit * unit * (cov[0] + cov[2] + 2.0 * (_GRID_OF_MOSAIC if planes == 4 else _GRID) ** 2)
+    skewed = _disagreement(skew_u, skew_v, unit * unit * (cov[0] + cov[2] + 2.0 * _GRID**2))
     # half of it along the skew, half of it any way: a grid skews a spot one way and displaces it another
-    astray = 0.25 * (skew_u * skew_u + skew_v * skew_v) + (q[fields.SATURATED_PX] * unit) ** 2 * unit / radius
+    astray = 0.25 * (skewed[0] + skewed[2]) + (q[fields.SATURATED_PX] * unit) ** 2 * unit / radius
     cov[0], cov[1], cov[2] = (
-        unit * unit * cov[0] + 0.5 * skew_u * skew_u + astray,
-        unit * unit * cov[1] + 0.5 * skew_u * skew_v,
-        unit * unit * cov[2] + 0.5 * skew_v * skew_v + astray,
+        unit * unit * cov[0] + 0.5 * skewed[0] + astray,
+        unit * unit * cov[1] + 0.5 * skewed[1],
+        unit * unit * cov[2] + 0.5 * skewed[2] + astray,
     )
     if radius <= q[fields.SMALL_PX] * (1.6 if planes == 4 else 1.0) and sums[patch.EDGE] == 0.0:
         sample_noise = noise

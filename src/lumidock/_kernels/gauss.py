@@ -10,6 +10,7 @@ from lumidock.datatypes import Array, Image
 _ROUNDS, _REACH = 6, 9
 _PRIOR_DOF = 6.0  # how much the expected noise counts beside the residuals of a fit
 _PROFILE = 0.05  # share of the signal by which a spot's profile is no Gaussian
+_LEFT = 0.3  # share of the degrees of freedom that a fit leaves at least
 _FITTED = 2.0  # of the residuals' degrees of freedom, that the position takes up where noise is not shared
 
 
@@ -176,7 +177,7 @@ def _misfit(
     if weight <= 0.0:
         return 1.0
     dof = weight * weight / square
-    return max((_PRIOR_DOF + dof * total / weight) / (_PRIOR_DOF + max(dof - fitted, 0.0)), least / weight)
+    return max((_PRIOR_DOF + dof * total / weight) / (_PRIOR_DOF + max(dof - fitted, _LEFT * dof)), least / weight)
 
 
 @njit(cache=True)

@@ -17,7 +17,6 @@ _QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth hav
 # share of a peak's height that a lens that blurs by 0.65 px, 1 sigma, gives the pixels around it; on a mosaic those of
 # other colours get a quarter of it from a lamp of one colour
 _AROUND, _AROUND_OF_MOSAIC = 0.24, 0.06
-_THIN = 4  # pixels between the samples of a window that misses gaps between lights
 _MOST_SHARED = 36.0  # samples over which noise is the same; more is a texture
 _LEAST_STEP = 30.0  # levels by which a saturated light stands out in the plane that shows it best
 
@@ -84,7 +83,7 @@ def measure(
         sums = window[3]
         if part == 0.0:
             if not clipped:
-                _own(seen, window[1], where, start, True)
+                _own(seen, window[1], where, start)
                 return 0
             if sums[patch.OPEN] == 0.0 or reach >= 3.5 * q[fields.MAX_RADIUS_PX]:
                 _own_plateau(image, planes, scale, weight, v, u, reach, q, window, where, start, seen)
@@ -98,7 +97,7 @@ def measure(
         reach = wanted
     if part == 0.0:
         return 0
-    _own(seen, window[1], where, start, True)
+    _own(seen, window[1], where, start)
     ground[4] = (weight**2 * shared_by_plane**2).sum() / (weight**2).sum()
     if planes == 3:  # in the sum of channels fine noise is what JPEG leaves, and coarse noise that of the sensor
         ground[4] = min(max(ground[4] * (expected / ground[1]) ** 2, 1.0), _MOST_SHARED)
@@ -198,26 +197,14 @@ def _holds_another(stamp: Image, where: Array, mark: int, spots: Array, n: int) 
 
 
 @njit(cache=True)
-def _own(seen: Image, stamp: Image, where: Array, start: Indices, cautious: bool) -> None:
-    """Mark the tiles that the grown region touches: nobody looks there again.
-
-    One in a much thinned out window may have leapt over a gap, to a light beside something large and bright: if
-    `cautious`, only samples that lie inside it count there.
-    """
+def _own(seen: Image, stamp: Image, where: Array, start: Indices) -> None:
+    """Mark the tiles that the grown region touches: nobody looks there again."""
     mark, t = stamp[start[1], start[0]], tiles.TILE_PX
-    unit, rows, columns = int(where[patch.UNIT]), int(where[patch.ROWS]), int(where[patch.COLUMNS])
-    only_inside = cautious and unit >= _THIN
-    for y in range(rows):
+    unit = int(where[patch.UNIT])
+    for y in range(int(where[patch.ROWS])):
         top = int(where[patch.TOP]) + y * unit
-        for x in range(columns):
+        for x in range(int(where[patch.COLUMNS])):
             if stamp[y, x] == mark:
-                if only_inside and (
-                    stamp[max(y - 1, 0), x] != mark
-                    or stamp[min(y + 1, rows - 1), x] != mark
-                    or stamp[y, max(x - 1, 0)] != mark
-                    or stamp[y, min(x + 1, columns - 1)] != mark
-                ):
-                    continue
                 left = int(where[patch.LEFT]) + x * unit
                 for i in range(top // t, (top + unit - 1) // t + 1):
                     for j in range(left // t, (left + unit - 1) // t + 1):
@@ -252,4 +239,4 @@ def _own_plateau(
     start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
     window[1][:] = 0
     patch.grow(window, where, image, start[0], start[1], LEVELS[-1] * least, q[fields.CLIPPED], 1)
-    _own(seen, window[1], where, start, False)
+    _own(seen, window[1], where, start)
