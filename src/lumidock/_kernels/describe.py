@@ -67,7 +67,8 @@ def describe(
         other_u, other_v = _plane_shift(image, planes, scale, weight, window, where, start, higher)
         skew_u, skew_v = skew_u + other_u - shift_u, skew_v + other_v - shift_v
     noise_of_balance = unit * unit * (cov[0] + cov[2] + 2.0 * (_GRID_OF_MOSAIC if planes == 4 else _GRID) ** 2)
-    skewed = _disagreement(skew_u, skew_v, unit * unit * (cov[0] + cov[2] + 2.0 * _GRID**2))
+    # the higher region is a part of the lower one, so that half of their noise is common
+    skewed = _disagreement(skew_u, skew_v, 0.5 * unit * unit * (cov[0] + cov[2] + 2.0 * _GRID**2))
     # half of it along the skew, half of it any way: a grid skews a spot one way and displaces it another
     astray = 0.25 * (skewed[0] + skewed[2]) + (q[fields.SATURATED_PX] * unit) ** 2 * unit / radius
     cov[0], cov[1], cov[2] = (
