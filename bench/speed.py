@@ -29,7 +29,7 @@ from lumidock.paper import PaperLocalizer
 from lumidock.station import Station
 from lumidock.streams.sources import open_source
 
-_Z_M, _ROUNDS, _SEED = (18.0, 9.0, 2.3), 7, 7100
+_Z_M, _ROUNDS, _SEED, _STARTS = (18.0, 9.0, 2.3), 7, 7100, 3
 _OUTPUT = {
     "mono8": ("output.pixels=mono8", "output.color=false", "output.file=png"),
     "bayer_rggb8": ("output.pixels=bayer8", "output.file=png"),
@@ -39,14 +39,18 @@ _OTHERS = np.zeros(1 << 26, np.uint8)
 Times = dict[str, list[float]]
 
 
+def simulate(z_m: float, kind: str, out: Path) -> None:
+    """Render some consecutive frames of the approach around a distance, as a camera of this kind gives them."""
+    command = [sys.executable, "-m", "lumidock", "sim", "approach", "--seed", str(_SEED), "--out", str(out)]
+    for setting in (f"path.start_z_m={z_m + 0.6}", f"path.end_z_m={z_m - 0.3}", *_OUTPUT[kind]):
+        command += ["--set", setting]
+    subprocess.run(command, check=True, capture_output=True)
+
+
 def sequence(z_m: float, kind: str) -> list[Frame]:
-    """Some consecutive frames of the approach around a distance, as a camera of this kind gives them."""
+    """These frames, decoded."""
     with TemporaryDirectory() as name:
-        command = [sys.executable, "-m", "lumidock", "sim", "approach", "--seed", str(_SEED), "--out", f"{name}/s"]
-        settings = [f"path.start_z_m={z_m + 0.6}", f"path.end_z_m={z_m - 0.3}", *_OUTPUT[kind]]
-        for setting in settings:
-            command += ["--set", setting]
-        subprocess.run(command, check=True, capture_output=True)
+        simulate(z_m, kind, Path(name) / "s")
         return [frame for frame in open_source(Path(name) / "s").items() if isinstance(frame, Frame)]
 
 
@@ -172,23 +176,39 @@ image = np.load({path!r})
 for k in range(3):
     localizer.process(Frame(str(k), k * 150_000_000, np.ascontiguousarray(np.roll(image, k, axis=0))))
 print(time.perf_counter() - start)
-import resource; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
+"""
+_PEAK = """
+import resource, subprocess, sys
+subprocess.run(sys.argv[1:], check=True, capture_output=True)
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024.0)
 """
 
 
-def start_up(frame: Frame) -> tuple[float, float, float]:
-    """Seconds to the third frame with empty and with warm caches of compiled code, and peak memory in MiB."""
+def start_up(frame: Frame) -> tuple[float, float]:
+    """Seconds to the third frame with empty and with warm caches of compiled code."""
     with TemporaryDirectory() as name:
         np.save(f"{name}/frame.npy", frame.image)
         code = _START.format(path=f"{name}/frame.npy")
         environment = os.environ | {"NUMBA_CACHE_DIR": f"{name}/cache"}
         runs = []
-        for _ in range(2):
+        for _ in range(1 + _STARTS):
             done = subprocess.run(
                 [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=environment
             )
-            runs.append([float(line) for line in done.stdout.split()])
-    return runs[0][0], runs[1][0], runs[1][1]
+            runs.append(float(done.stdout))
+    return runs[0], float(np.median(runs[1:]))
+
+
+def peak_memory() -> float:
+    """MiB of a process that runs over a folder of BGR frames and has nothing to compile."""
+    with TemporaryDirectory() as name:
+        simulate(9.0, "bgr8", Path(name) / "s")
+        peaks = []
+        for run in ("first", "second"):  # the first one may compile
+            words = [sys.executable, "-m", "lumidock", "run", f"{name}/s", "--out", f"{name}/{run}"]
+            done = subprocess.run([sys.executable, "-c", _PEAK, *words], check=True, capture_output=True, text=True)
+            peaks.append(float(done.stdout))
+    return peaks[1]
 
 
 def main() -> tuple[dict[str, object], list[str]]:
@@ -220,13 +240,14 @@ def main() -> tuple[dict[str, object], list[str]]:
             lines.append(f"| {kind}: {job} | " + " | ".join(f"{m:.2f} ({m / one_pass:.1f})" for m in medians) + " |")
     content["growth_ms"] = grown = growth((2, 20, 200))
     content["matching_ms"] = named = matching_growth((7, 13, 25, 50), (0, 2, 10, 50))
-    cold_s, warm_s, peak = start_up(frames[9.0, "bgr8"][0])
+    (cold_s, warm_s), peak = start_up(frames[9.0, "bgr8"][0]), peak_memory()
     content |= {"start_cold_s": cold_s, "start_warm_s": warm_s, "peak_mib": peak, "machine": machine()}
     lines += ["", "Full search of a mono frame, ms: " + ", ".join(f"{k} {v:.2f}" for k, v in grown.items()) + "."]
     lines.append("Naming a frame without history, ms, median and largest:")
     lines[-1] += " " + ", ".join(f"{k} {a:.2f} / {b:.2f}" for k, (a, b) in named.items()) + "."
     lines.append(
-        f"Start to the third frame: {cold_s:.1f} s while compiling, {warm_s:.2f} s after; peak memory {peak:.0f} MiB."
+        f"Start to the third frame: {cold_s:.1f} s while compiling, {warm_s:.2f} s after; peak memory of a run over a "
+        f"folder {peak:.0f} MiB."
     )
     lines += ["", machine()]
     return content, lines

@@ -2,6 +2,7 @@
 
 import time
 
+import cv2
 import numpy as np
 import pytest
 from bench.shipped import shipped_camera, shipped_station
@@ -122,6 +123,23 @@ def test_a_saturated_core_with_a_wide_halo_is_one_light(color, rng):
     assert len(spots) == 1
     assert np.linalg.norm(spots.uv[0] - (400.3, 300.7)) < 0.15
     assert spots.p_light[0] > 0.5
+
+
+@pytest.mark.parametrize("part", range(8))
+def test_a_near_light_clipped_in_all_channels_is_found_whole_through_compression(part, rng):
+    rows, columns = np.indices((480, 640))
+    radius = rng.uniform(12.0, 30.0)
+    u, v = rng.uniform(1.6 * radius, 640 - 1.6 * radius), rng.uniform(1.6 * radius, 480 - 1.6 * radius)
+    away = np.hypot(columns - u, rows - v)
+    halo = np.exp(-np.maximum(away - radius, 0.0) / (1.2 * radius))
+    core = 400.0 * np.clip(0.5 * (radius + 1.0 - away), 0.0, 1.0)
+    image = np.stack([70.0 + k * halo + core for k in (90.0, 130.0, 80.0)], axis=2)
+    image = to_picture(image + rng.normal(0.0, 2.0, image.shape))
+    coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
+    spots = found(cv2.imdecode(coded, cv2.IMREAD_COLOR))
+    best = np.hypot(*(spots.uv - (u, v)).T).argmin()
+    assert np.hypot(*(spots.uv[best] - (u, v))) < 0.5, f"part {part}"
+    assert 0.7 < spots.radius_px[best] / radius < 1.35
 
 
 def test_two_lights_are_two_when_apart_and_one_when_merged(rng):

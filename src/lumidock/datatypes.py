@@ -25,10 +25,10 @@ def require_shape(name: str, array: np.ndarray, *shape: int | None) -> None:
 
     Raises: ValueError naming the array and both shapes.
     """
-    fits = array.ndim == len(shape) and all(
-        want is None or have == want for have, want in zip(array.shape, shape, strict=True)
-    )
-    if not fits:
+    have = array.shape
+    if have == shape:
+        return
+    if len(have) != len(shape) or any(want not in (None, n) for n, want in zip(have, shape, strict=True)):
         raise ValueError(f"{name} has shape {array.shape}, wanted {shape}")
 
 
@@ -93,10 +93,13 @@ class Detections:
         require_shape("uv", self.uv, None, 2)
         if not np.isfinite(self.uv).all():
             raise ValueError("uv is not finite")
-        for name in ("radius_px", "flux", "p_light", "p_rear"):
-            require_shape(name, getattr(self, name), len(self.uv))
+        n = len(self.uv)
+        require_shape("radius_px", self.radius_px, n)
+        require_shape("flux", self.flux, n)
+        require_shape("p_light", self.p_light, n)
+        require_shape("p_rear", self.p_rear, n)
         if self.cov_px2 is not None:
-            require_shape("cov_px2", self.cov_px2, len(self.uv), 2, 2)
+            require_shape("cov_px2", self.cov_px2, n, 2, 2)
 
     def __len__(self) -> int:
         return len(self.uv)

@@ -17,16 +17,14 @@ import numpy as np
 from lumidock._kernels import detect as kernels
 from lumidock._kernels import fields, tiles
 from lumidock.config import DetectConfig
-from lumidock.datatypes import Array, Detections, Frame, Indices
+from lumidock.datatypes import Array, Detections, Frame
 
 _SATURATED = 250.0  # of 255
 _SIXTEEN = 255.0 / 65535.0  # 8-bit levels of a 16-bit step
 _TWELVE_BITS = 16.0  # steps of a sensor of 12 bits in 16
-SWEEP = 8  # frames in which a tracked search has seen everything
-_DRIFT_PX = 20.0  # around a spot, in which it is looked for in the next frame
-_MOST_WINDOWS = 0.25  # of the frame; for more a full search is cheaper
+SWEEP = kernels.SWEEP
 _LEAST_SIDE = 4  # pixels; in less nothing stands out
-_MOST_SHARED = 6.0  # more is a texture
+_NOWHERE = np.empty((0, 3))
 
 
 class Scan:
@@ -43,47 +41,28 @@ class Scan:
         self.planes = 4 if frame.encoding.startswith("bayer") else self.channels
         self.scale = 1.0 if dtype == np.uint8 else _SIXTEEN
         maps = 1 if self.planes == 1 else 3
-        self.peak = np.zeros((maps, h, w), dtype)
-        self.line = np.empty((2, (width + 2 * tiles.TILE_PX) * self.channels), dtype)
-        self.raw_level, self.level = np.zeros((maps, hb, wb), dtype), np.zeros((maps, hb, wb), np.float32)
-        self.raw_sigma, self.sigma = np.zeros((hb, wb), np.float32), np.zeros((hb, wb), np.float32)
-        self.by_plane = np.zeros((2, maps, hb, -(-wb // tiles.SPARSE)), np.float32)
-        self.spread = np.ones(maps)
-        self.seen = np.zeros((h, w), np.uint8)
-        self.found = np.empty((h * w, 5))
-        self.spots = np.empty((config.max_spots, fields.COLUMNS))
-        self.whole = np.array([[0, h, 0, w]])
-        self.shared = np.ones(4)
-        self.least_noise = config.min_noise * (1.0 if dtype == np.uint8 else _TWELVE_BITS * _SIXTEEN)
-        self.q = _parameters(config, max(height, width), self.least_noise, self.planes == 4 or dtype != np.uint8)
-        self.swept, self.part = False, 0
-        self.last = np.empty((0, 3))
+        self.known = tiles.Map(
+            peak=np.zeros((maps, h, w), dtype),
+            raw_level=np.zeros((maps, hb, wb), dtype),
+            raw_sigma=np.zeros((hb, wb), np.float32),
+            by_plane=np.zeros((2, maps, hb, -(-wb // tiles.SPARSE)), np.float32),
+            level=np.zeros((maps, hb, wb), np.float32),
+            sigma=np.zeros((hb, wb), np.float32),
+            spread=np.ones(maps),
+            shared=np.ones(4),
+            line=np.empty((3, w * tiles.TILE_PX * self.channels), dtype),
+            seen=np.zeros((h, w), np.uint8),
+            found=np.empty((h * w, 5)),
+        )
+        least_noise = config.min_noise * (1.0 if dtype == np.uint8 else _TWELVE_BITS * _SIXTEEN)
+        self.q = _parameters(config, max(height, width), least_noise, self.planes == 4 or dtype != np.uint8)
+        self.most = (config.max_candidates, config.max_measured)
+        self.spots, self.count = np.empty((config.max_spots, fields.COLUMNS)), 0
+        self.part = -1  # of SWEEP, whose turn it is; nothing was seen yet
 
     def fits(self, frame: Frame) -> bool:
         """Whether a frame is like those that this was made for."""
         return self.like == (frame.image.shape, frame.image.dtype, frame.encoding)
-
-    def next_part(self) -> tuple[int, int]:
-        """The rows of blocks whose turn it is; after the last ones, what all of them say is brought up to date."""
-        rows = len(self.sigma)
-        first, last = self.part * rows // SWEEP, (self.part + 1) * rows // SWEEP
-        self.part = (self.part + 1) % SWEEP
-        if self.part == 0:
-            _settle(self)
-        return first, last
-
-    def windows(self, expected: Array) -> Indices:
-        """Tiles (n, 4) around the expected lights and the spots of the last frame, and of the part whose turn it is.
-
-        The whole frame where windows would be a good part of it.
-        """
-        rows, (h, w) = len(self.sigma), self.peak.shape[1:]
-        first, last = self.part * rows // SWEEP, (self.part + 1) * rows // SWEEP
-        rects = np.empty((len(expected) + len(self.last) + 1, 4), np.int64)
-        count = tiles.windows(expected, self.last, _DRIFT_PX, h, w, rects)
-        rects[count] = first * tiles.BLOCK, min(last * tiles.BLOCK, h), 0, w
-        rects = rects[: count + 1]
-        return rects if tiles.area(rects) < _MOST_WINDOWS * h * w else self.whole
 
 
 def _parameters(config: DetectConfig, longer_side: int, least_noise: float, linear: bool) -> Array:
@@ -113,64 +92,36 @@ def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None, expecte
     if min(frame.image.shape[:2]) < _LEAST_SIDE:
         return _detections(frame, np.empty((0, fields.COLUMNS)))
     scan = scan if scan is not None and scan.fits(frame) else Scan(frame, config)
-    rows = np.ascontiguousarray(frame.image).reshape(len(frame.image), -1)
-    rects = scan.windows(expected) if expected is not None and scan.swept else scan.whole
-    if rects is scan.whole:
-        _look(rows, scan, (0, len(scan.sigma)))
-        _settle(scan)
-        scan.swept, scan.part = True, 0
-    else:
-        first, last = scan.next_part()
-        _look(rows, scan, (first, last))
-        tiles.revisit(rows, scan.planes, rects[:-1], scan.peak, scan.line)
-    return _search(frame, rows, scan, rects, config)
-
-
-def _look(rows: Array, scan: Scan, blocks: tuple[int, int]) -> None:
-    """Bring some rows of blocks up to date."""
-    tiles.survey(rows, scan.planes, blocks, scan.peak, scan.line, scan.raw_level, scan.raw_sigma, scan.by_plane)
-
-
-def _settle(scan: Scan) -> None:
-    """What all blocks say together."""
-    most = 1.0 if scan.planes == 4 else _MOST_SHARED
-    least = scan.least_noise / scan.scale
-    tiles.settle(
-        scan.raw_level, scan.raw_sigma, scan.by_plane, least, most, scan.level, scan.sigma, scan.spread, scan.shared
-    )
-
-
-def _search(frame: Frame, rows: Array, scan: Scan, rects: Indices, config: DetectConfig) -> Detections:
-    image = rows.reshape(len(rows), -1, scan.channels)
-    n = kernels.search(
+    height, width = frame.image.shape[:2]
+    image = np.ascontiguousarray(frame.image).reshape(height, width, scan.channels)
+    if expected is None:
+        scan.part, expected = -1, _NOWHERE
+    scan.count, whole = kernels.see(
         image,
         scan.planes,
         scan.scale,
-        scan.peak,
-        scan.level,
-        scan.sigma,
-        scan.spread,
-        scan.shared,
-        rects,
-        (config.max_candidates, config.max_measured),
+        scan.known,
+        scan.part,
+        expected,
+        scan.count,
+        scan.most,
         scan.q,
-        scan.seen,
-        scan.found,
         scan.spots,
     )
-    scan.last = scan.spots[:n, [fields.U, fields.V, fields.RADIUS]]
-    return _detections(frame, scan.spots[:n])
+    scan.part = 0 if whole else (scan.part + 1) % SWEEP
+    return _detections(frame, scan.spots[: scan.count])
 
 
 def _detections(frame: Frame, spots: Array) -> Detections:
+    columns = spots.T.copy()
     return Detections(
         frame.name,
         frame.t_ns,
-        spots[:, :2].copy(),
-        spots[:, fields.RADIUS].copy(),
-        spots[:, fields.FLUX].copy(),
-        spots[:, fields.P_LIGHT].copy(),
+        spots[:, : fields.V + 1].copy(),
+        columns[fields.RADIUS],
+        columns[fields.FLUX],
+        columns[fields.P_LIGHT],
         np.full(len(spots), np.nan),
-        spots[:, [fields.VAR_UU, fields.VAR_UV, fields.VAR_UV, fields.VAR_VV]].reshape(-1, 2, 2),
+        spots[:, fields.VAR_UU : fields.VAR_VV + 1].copy().reshape(-1, 2, 2),
         frame.attitude,
     )

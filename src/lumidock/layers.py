@@ -26,7 +26,8 @@ def label(frame: Frame, detections: Detections, config: LabelConfig) -> Detectio
         if np.isnan(detections.p_rear).all():
             return detections
         return replace(detections, p_rear=np.full(len(detections), np.nan))
-    signal, sigma = np.empty((len(detections), 3)), np.empty((len(detections), 3))
+    p_rear = np.empty(len(detections))
+    decide = (config.blue_ratio, config.softness, config.min_signal, config.limit)
     image = frame.image[:, :, None] if mosaic else frame.image
     colors(
         image,
@@ -40,10 +41,10 @@ def label(frame: Frame, detections: Detections, config: LabelConfig) -> Detectio
         config.ring,
         config.clear_px,
         config.min_reach_px,
-        signal,
-        sigma,
+        decide,
+        p_rear,
     )
-    return replace(detections, p_rear=_from_signal(signal, sigma, config))
+    return replace(detections, p_rear=p_rear)
 
 
 @cache
@@ -57,15 +58,3 @@ def _order(encoding: str) -> Indices:
     """Colour of each channel, or of each corner of a mosaic's cell: B, G, R = 0, 1, 2."""
     letters = encoding.removeprefix("bayer_")[:4] if encoding.startswith("bayer") else "bgr"
     return np.array([_OF_LETTER[letter] for letter in letters], np.int64)
-
-
-def _from_signal(signal: Array, sigma: Array, config: LabelConfig) -> Array:
-    """P(rear) (N,) from the linear light (N, 3) of B, G, R over the background and its error; NaN where too weak."""
-    other = np.maximum(signal[:, 1], signal[:, 2])
-    other_sigma = np.where(signal[:, 2] > signal[:, 1], sigma[:, 2], sigma[:, 1])
-    blue, rest = np.maximum(signal[:, 0], sigma[:, 0]), np.maximum(other, other_sigma)
-    error = np.hypot(sigma[:, 0] / blue, other_sigma / rest)
-    odds = (np.log(blue / rest) - np.log(config.blue_ratio)) / np.hypot(config.softness, error)
-    p_rear = np.clip(1.0 / (1.0 + np.exp(-odds)), config.limit, 1.0 - config.limit)
-    strong = np.maximum(signal[:, 0] / sigma[:, 0], other / other_sigma) >= config.min_signal
-    return np.where(strong, p_rear, np.nan)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from lumidock import detect, integrity, layers, match, track, verify
+from lumidock._kernels.track import Foreseen
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Fix, Frame, Match, Stage, Status
@@ -17,6 +19,14 @@ from lumidock.station import Station
 from lumidock.track import Track
 
 _MIN_LIGHTS, _MIN_SOLID, _MAX_LIGHTS, _MAX_SPOTS, _MAX_RIVALS = 3, 4, 128, 200, 8
+
+
+class _Ahead(NamedTuple):
+    """A belief `moved` to the time of the next frame, and the `view` that it expects there."""
+
+    belief: Track
+    moved: Track
+    view: Foreseen
 
 
 class Localizer:
@@ -44,6 +54,7 @@ class Localizer:
         self._stage: Stage = "search"
         self._last: Detections | None = None
         self._slow: tuple[Array, Array] | None = None
+        self._ahead: _Ahead | None = None
 
     def process(self, frame: Frame) -> Fix:
         """Image door. Raises: FrameError when the image is not of the camera's size."""
@@ -64,7 +75,9 @@ class Localizer:
         belief = self.beliefs[0]
         if belief.t_ns < self._last.t_ns or t_ns - belief.lights_ns > self.config.track.max_gap_s * 1e9:
             return None
-        return track.foresee(track.predict(belief, t_ns, self.config.track), self._plan)
+        moved = track.predict(belief, t_ns, self.config.track)
+        self._ahead = _Ahead(belief, moved, track.look(moved, self._plan))
+        return track.foresee(self._ahead.view)
 
     def process_detections(self, detections: Detections) -> Fix:
         """Light door: detections from another detector, or from `process`."""
@@ -116,10 +129,11 @@ class Localizer:
 
     def _predict(self, beliefs: list[Track], detections: Detections) -> list[Track]:
         """Beliefs at the time of this frame; those without lights for too long, or from the future, are dropped."""
-        config, t_ns, later = self.config.track, detections.t_ns, []
+        config, t_ns, later, ahead = self.config.track, detections.t_ns, [], self._ahead
         for belief in beliefs:
             if belief.t_ns < t_ns <= belief.lights_ns + config.max_gap_s * 1e9:
-                moved = track.predict(belief, t_ns, config)
+                known = ahead is not None and ahead.belief is belief and ahead.moved.t_ns == t_ns
+                moved = ahead.moved if ahead and known else track.predict(belief, t_ns, config)
                 later.append(track.attend(moved, detections.attitude) if detections.attitude else moved)
         return later
 
@@ -137,15 +151,19 @@ class Localizer:
         """
         followed, unjudged = [], []
         for belief in beliefs:
-            found = track.associate(belief, seen, self._plan, self.config)
+            ahead = self._ahead
+            view = ahead.view if ahead and ahead.moved is belief else None
+            found = track.associate(belief, seen, self._plan, self.config, view)
             if found.log_evidence == -math.inf:
                 return []
             if not (found.name >= 0).any():
                 continue
-            weighed = replace(belief, log_weight=belief.log_weight + found.log_evidence)
-            updated = track.update(weighed, found.name, seen, self._plan, self.config.track)
+            updated = track.update(
+                belief, found.name, seen, self._plan, self.config.track, log_evidence=found.log_evidence
+            )
             if updated is None:
-                unjudged.append(replace(weighed, name=found.name))
+                weight = belief.log_weight + found.log_evidence
+                unjudged.append(replace(belief, log_weight=weight, name=found.name))
             else:
                 followed.append(updated)
         kept = self._likeliest([*followed, *unjudged])

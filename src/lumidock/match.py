@@ -190,7 +190,7 @@ class Spots:
     @property
     def lamps(self) -> int:
         """How many of the detections are rather lamps than not."""
-        return int((self.p_light >= _LAMP).sum())
+        return int(np.count_nonzero(self.p_light >= _LAMP))
 
 
 def spots(detections: Detections, plan: Plan, config: MatchConfig) -> Spots:

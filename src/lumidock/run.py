@@ -106,6 +106,7 @@ def run(
             folder.add(fix, latency_us, t_ns=item.t_ns)
             summary.count(fix, latency_us, error)
             on_fix(item, fix)
+            del item  # the next picture is read into its room
         summary.finished = True
     finally:
         folder.describe(identity | {"counts": summary.as_dict()})

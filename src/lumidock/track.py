@@ -27,7 +27,7 @@ _NEVER = -(2**62)
 _FLATTENINGS = 12  # the flatter the view, the wider the tilt it leaves; then it stands
 NO_PLANE = np.full(6, np.nan)
 LAYER_LIGHTS, _PROOF_LIGHTS = 3, 4
-_MARGIN_PX, _MAX_REACH_PX = 16.0, 200.0  # of the window around a light that is foreseen
+_MARGIN_PX, _MAX_REACH_PX = 8.0, 200.0  # of the window around a light that is foreseen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +72,7 @@ class Track:
     @property
     def n_used(self) -> int:
         """Lights in the last frame that agreed."""
-        return int((self.name >= 0).sum())
+        return int(np.count_nonzero(self.name >= 0))
 
 
 def slow_states(station: Station, attitude: Attitude | None) -> tuple[Array, Array]:
@@ -171,17 +171,18 @@ def attend(track: Track, attitude: Attitude) -> Track:
     return replace(track, R=R, t=t, x=x, P=P)
 
 
-def foresee(track: Track, plan: Plan) -> Array:
+def foresee(foreseen: Foreseen) -> Array:
     """Where the lights of a predicted track will be seen: (n, 3) u, v and reach, four sigmas and a margin, px."""
-    expected, S, shown = _look(track, plan)
-    variance = np.diagonal(S)
-    reach = 4.0 * np.sqrt(np.maximum(np.maximum(variance[::2], variance[1::2]), 0.0)) + _MARGIN_PX
-    seen = (shown > 0.0) & np.isfinite(expected).all(axis=1) & np.isfinite(reach)
-    return np.column_stack([expected, np.minimum(reach, _MAX_REACH_PX)])[seen]
+    expected, S, shown = foreseen
+    variance = S.diagonal().reshape(-1, 2).max(axis=1)
+    windows = np.empty((len(shown), 3))
+    windows[:, :2] = expected
+    windows[:, 2] = np.minimum(4.0 * np.sqrt(np.maximum(variance, 0.0)) + _MARGIN_PX, _MAX_REACH_PX)
+    return windows[(shown > 0.0) & np.isfinite(windows).all(axis=1)]
 
 
-def _look(track: Track, plan: Plan) -> Foreseen:
-    """Where the lights are expected."""
+def look(track: Track, plan: Plan) -> Foreseen:
+    """Where the lights of a predicted track are expected."""
     m = len(plan.p_dock)
     foreseen = Foreseen(np.empty((m, 2)), np.empty((2 * m, 2 * m)), np.empty(m))
     kernel.look(plan.lens, State(track.R, track.t, track.x, track.P), plan.p_dock, plan.axis, foreseen)
@@ -196,13 +197,15 @@ class Association:
     log_evidence: float
 
 
-def associate(track: Track, seen: Spots, plan: Plan, config: Config) -> Association:
+def associate(track: Track, seen: Spots, plan: Plan, config: Config, foreseen: Foreseen | None = None) -> Association:
     """Name the detections under the prediction, with backtracking and a missing branch; drop what stays in doubt.
+
+    `foreseen`: what `look` said of this track, where it has been asked.
 
     A layer that was not in view enters with three lights or more, or not at all: where the tilt is open, a stray spot
     in the wide gate of a single light would set it.
     """
-    foreseen = _look(track, plan)
+    foreseen = foreseen or look(track, plan)
     known = (track.t_ns - track.layer_ns <= config.track.max_gap_s * 1e9)[plan.layer]
     best = _search(foreseen._replace(shown=np.where(known, foreseen.shown, 0.0)), seen, plan, config)
     if not known.all() and foreseen.shown[~known].any():
@@ -240,16 +243,20 @@ def update(
     *,
     at: Array | None = None,
     turn_cov: Array | None = None,
+    log_evidence: float = 0.0,
 ) -> Track | None:
     """The track with the named pixels taken in, linearised first at the pose `at`; None where that fails.
+
+    `log_evidence` of the names goes to its weight.
 
     A single plane is linearised as flat as `turn_cov` (3, 3), by default the track's own, lets it be. From the first
     frame on that names `joint_lights` lights of two layers, calibration and light positions move too.
     """
-    joint = track.joint or is_joint(name, plan, config)
+    count = np.bincount(plan.layer[name >= 0], minlength=plan.n_layers)
+    joint = track.joint or _is_joint(count, config)
     R0, t0, x, P = track.R, track.t, track.x.copy(), track.P.copy()
     R, t = (track.R.copy(), track.t.copy()) if at is None else (at[:3, :3].copy(), at[:3, 3].copy())
-    apart, plane = np.zeros((len(name), 18)), _plane(name, plan, joint=track.joint)
+    apart, plane = np.zeros((len(name), 18)), _plane(count, plan, joint=track.joint)
     nis = take_in(
         plan.lens,
         plan.p_dock,
@@ -264,14 +271,14 @@ def update(
         at is None,
         apart,
     )
-    if not np.isfinite(nis):
+    if not math.isfinite(nis):
         return None
-    count = np.bincount(plan.layer[name >= 0], minlength=plan.n_layers)
+    used = int(count.sum())
     layer_ns = np.where((count >= LAYER_LIGHTS) | (track.layer_ns > _NEVER) & (count > 0), track.t_ns, track.layer_ns)
     # a pose of which nothing was known takes up six of the pixels' degrees of freedom
-    dof = 2 * int(count.sum()) - (0 if at is None else 6)
+    dof = 2 * used - (0 if at is None else 6)
     surprise = _deviate(nis, dof) if dof > 0 else 0.0
-    agreed_ns = track.t_ns if count.sum() >= _PROOF_LIGHTS else track.agreed_ns
+    agreed_ns = track.t_ns if used >= _PROOF_LIGHTS else track.agreed_ns
     lately = track.t_ns - track.agreed_ns <= config.max_gap_s * 1e9
     proof = (track.proof if lately else 0) + int(agreed_ns == track.t_ns)
     return Track(
@@ -282,7 +289,7 @@ def update(
         x,
         P,
         joint,
-        track.log_weight,
+        track.log_weight + log_evidence,
         proof,
         track.t_ns,
         agreed_ns,
@@ -302,19 +309,22 @@ def _deviate(square: float, dof: int) -> float:
     return float(((square / dof) ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(spread))
 
 
-def _plane(name: Indices, plan: Plan, *, joint: bool) -> Array:
-    """A point and the normal (6,) of the plane that all named lights lie on, NaN where its slant is no question.
+def _plane(count: Indices, plan: Plan, *, joint: bool) -> Array:
+    """A point and the normal (6,) of the plane of all lights named, `count` (L,); NaN where its slant is no question.
 
     It is none with two layers in view, and with four lights or more of a track that has seen two.
     """
-    named = plan.layer[name >= 0]
-    alone = 0 < len(named) < (_PROOF_LIGHTS if joint else len(name) + 1) and (named == named[0]).all()
-    return plan.planes[named[0]] if alone else NO_PLANE
+    most = int(count.argmax())
+    alone = 0 < count[most] == count.sum() and not (joint and count[most] >= _PROOF_LIGHTS)
+    return plan.planes[most] if alone else NO_PLANE
 
 
 def is_joint(name: Indices, plan: Plan, config: TrackConfig) -> bool:
     """Whether at least two layers show enough lights."""
-    count = np.bincount(plan.layer[name >= 0], minlength=plan.n_layers)
+    return _is_joint(np.bincount(plan.layer[name >= 0], minlength=plan.n_layers), config)
+
+
+def _is_joint(count: Indices, config: TrackConfig) -> bool:
     return int((count >= config.joint_lights).sum()) >= 2
 
 

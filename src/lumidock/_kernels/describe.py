@@ -19,7 +19,7 @@ _BETWEEN = np.sqrt(1.0 / 12.0)  # 1 sigma of an instant between two fields, of t
 _FINE_MARK, _SKEW_MARK = 100, 101  # of regions grown again, beside those of the levels tried
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def describe(
     image: Image,
     planes: int,
@@ -105,12 +105,12 @@ def describe(
     spot[fields.U], spot[fields.V] = center
     floor = _floor(planes, weight, spot, sums, q) + (q[fields.TEXTURE] * ground[3] * radius / (top - ground[0])) ** 2
     spot[fields.VAR_UU] = cov[0] + floor + merged[0] + apart[0]
-    spot[fields.VAR_UV] = cov[1] + merged[1] + apart[1]
+    spot[fields.VAR_UV] = spot[fields.VAR_VU] = cov[1] + merged[1] + apart[1]
     spot[fields.VAR_VV] = cov[2] + floor + merged[2] + apart[2]
     return not _is_known(spots, n)
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _size(
     window: Window, where: Array, start: Indices, ground: Array, level: float, shared: float, spot: Array
 ) -> None:
@@ -130,7 +130,7 @@ def _size(
     spot[fields.SATURATED], spot[fields.CUT] = sums[patch.CLIPPED] / area, sums[patch.EDGE] / area
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _floor(planes: int, weight: Array, spot: Array, sums: Array, q: Array) -> float:
     """Variance of a centre that has no noise."""
     coarse = planes == 3 and weight[1] < max(weight[0], weight[2])
@@ -142,20 +142,20 @@ def _floor(planes: int, weight: Array, spot: Array, sums: Array, q: Array) -> fl
     return float(variance)
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def small_snr(part: Array, where: Array, x: float, y: float, width: float, ground: Array, shared: float) -> float:
     """How far a Gaussian window stands out of noise, which averages out in it, and texture, which does not."""
     amplitude, averaged = patch.filtered(part, where, x, y, width, ground[0])
     return float(amplitude / np.sqrt(shared * ground[1] ** 2 / averaged + ground[2] ** 2))
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def index(x: int, first: float, unit: float, count: float) -> int:
     """Sample of a window that holds pixel `x`."""
     return min(int((x - first) / unit), int(count) - 1)
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def peak_value(part: Array, where: Array, start: Indices) -> float:
     """Largest sample around the start of a spot."""
     best = -1e9
@@ -168,21 +168,21 @@ def peak_value(part: Array, where: Array, start: Indices) -> float:
     return best
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _around(part: Array, where: Array, start: Indices, sums: Array, radii: float, floor: float) -> float:
     """Mean level over the floor on a circle around a region's centre, of so many of its radii."""
     radius = radii * np.sqrt(sums[patch.N] / np.pi) + 1.0
     x, y = start[0] + sums[patch.X] / sums[patch.N], start[1] + sums[patch.Y] / sums[patch.N]
     total, count = 0.0, 0
     for k in range(12):
-        a, b = int(x + radius * np.cos(k * np.pi / 6.0) + 0.5), int(y + radius * np.sin(k * np.pi / 6.0) + 0.5)
+        a, b = int(x + radius * samples.COS[2 * k] + 0.5), int(y + radius * samples.SIN[2 * k] + 0.5)
         if 0 <= a < where[patch.COLUMNS] and 0 <= b < where[patch.ROWS]:
             total += part[b, a] - floor
             count += 1
     return total / max(count, 1)
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _plane_shift(
     image: Image, planes: int, scale: float, weight: Array, window: Window, where: Array, start: Indices, level: float
 ) -> tuple[float, float]:
@@ -226,7 +226,7 @@ def _plane_shift(
     return float((share[1] + share[3]) / share.sum()), float((share[2] + share[3]) / share.sum())
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _skew(
     image: Image, window: Window, where: Array, start: Indices, level: float, q: Array, unit: float
 ) -> tuple[float, float]:
@@ -242,7 +242,7 @@ def _skew(
     return skew
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _disagreement(du: float, dv: float, expected: float) -> tuple[float, float, float]:
     """Covariance by two estimates of a centre, for what they differ beyond two sigma: its profile is uneven."""
     square = du * du + dv * dv
@@ -250,7 +250,7 @@ def _disagreement(du: float, dv: float, expected: float) -> tuple[float, float, 
     return share * du * du, share * du * dv, share * dv * dv
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _unresolved(sums: Array, q: Array, unit: float) -> tuple[float, float, float]:
     """Covariance of a region too long for one light: two that are not told apart, and either may be the one meant."""
     uu, uv, vv = patch.moments(sums)
@@ -261,7 +261,7 @@ def _unresolved(sums: Array, q: Array, unit: float) -> tuple[float, float, float
     return excess * (turn + 0.5 * (uu - vv)), excess * uv, excess * (turn - 0.5 * (uu - vv))
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _is_known(spots: Array, n: int) -> bool:
     for k in range(n):
         if np.hypot(spots[k, fields.U] - spots[n, fields.U], spots[k, fields.V] - spots[n, fields.V]) < max(

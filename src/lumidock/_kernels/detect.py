@@ -8,49 +8,97 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lumidock._kernels import fields, patch, tiles
+from lumidock._kernels import fields, patch, peaks, tiles
 from lumidock._kernels.likelihood import dim_glints, dim_small_fry, lamp_probability
 from lumidock._kernels.measure import measure
 from lumidock.datatypes import Array, Image, Indices
 
+SWEEP = 8  # frames in which a tracked search has seen everything
+_DRIFT_PX = 20.0  # around a spot, in which it is looked for in the next frame
+_MOST_WINDOWS = 0.25  # of the frame; for more a full search is cheaper
+_MOST_SHARED = 6.0  # more is a texture
+_NO_LIMIT = 1 << 16  # of a sample
+_SWEPT_STEP = 2  # a tracked search's sweep looks at every second row, where the smallest spot still has half its height
 
-@njit(cache=True)
-def search(
+
+@njit(cache=True, error_model="numpy")
+def see(
     image: Image,
     planes: int,
     scale: float,
-    peak: Image,
-    level: Array,
-    sigma: Array,
-    spread: Array,
-    shared_by_plane: Array,
+    known: tiles.Map,
+    part: int,
+    expected: Array,
+    before: int,
+    most: tuple[int, int],
+    q: Array,
+    spots: Array,
+) -> tuple[int, bool]:
+    """Write the spots of a frame to `spots` (N, COLUMNS), the strongest first.
+
+    `image` (H, W, C); `planes` 1, 3 or, for a mosaic, 4; `scale` makes 8-bit levels of its samples. Looked at is all of
+    it, with `part` -1; else the tiles around the `expected` places (n, 3) u, v, reach px, and around the spots of the
+    frame before, which are the first `before` in `spots`, and the `part` of `SWEEP` of the rest. `most`: candidates and
+    measurements. Returns how many spots there are, and whether all was looked at, as where windows are much of it.
+    """
+    rows, (h, w), blocks = image.reshape(len(image), -1), known.peak.shape[1:], len(known.sigma)
+    rects = np.empty((len(expected) + before + 1, 4), np.int64)
+    count, whole = 0, part < 0
+    first, last = part * blocks // SWEEP, (part + 1) * blocks // SWEEP
+    if not whole:
+        count = tiles.windows(expected, spots[:before], _DRIFT_PX, h, w, rects)
+        rects[count, 0], rects[count, 1] = first * tiles.BLOCK, min(last * tiles.BLOCK, h)
+        rects[count, 2], rects[count, 3] = 0, w
+        whole = tiles.area(rects[: count + 1]) >= _MOST_WINDOWS * h * w
+    if whole:
+        count, first, last = 0, 0, blocks
+        rects[0, 0], rects[0, 1], rects[0, 2], rects[0, 3] = 0, h, 0, w
+    tiles.survey(rows, planes, (first, last), 1 if whole else _SWEPT_STEP, known)
+    for k in range(count):
+        tiles.refresh(rows, planes, rects[k], 1, known.peak, known.line)
+    if whole or part == SWEEP - 1:
+        tiles.settle(known, q[fields.MIN_NOISE] / scale, 1.0 if planes == 4 else _MOST_SHARED)
+    return _search(image, planes, scale, known, rects[: count + 1], most, q, spots), whole
+
+
+@njit(error_model="numpy")
+def _search(
+    image: Image,
+    planes: int,
+    scale: float,
+    known: tiles.Map,
     rects: Indices,
     most: tuple[int, int],
     q: Array,
-    seen: Image,
-    found: Array,
     spots: Array,
 ) -> int:
-    """Write the spots of the tiles in `rects` (n, 4) to `spots` (N, COLUMNS), the strongest first; returns how many.
-
-    `image` (H, W, C); `planes` 1, 3 or, for a mosaic, 4; `scale` makes 8-bit levels of its samples. `peak` (P, h, w)
-    of its tiles, `level` (P, h, w) and `sigma` (h, w) of its blocks in samples, `spread` (P,), see `tiles`. `most`:
-    candidates and measurements.
-    """
+    """Write the spots of the tiles in `rects` (n, 4) to `spots`, see `see`; returns how many."""
+    peak, level, sigma, spread, shared_by_plane = known.peak, known.level, known.sigma, known.spread, known.shared
+    seen, found = known.seen, known.found
     count = 0
     clipped = q[fields.CLIPPED] / scale
     contrast = q[fields.CONTRAST] * np.sqrt(shared_by_plane.max())
     for p in range(len(peak)):
-        seen[:] = 0  # a tile may hold a light in one plane and noise in another
+        tiles.clear(seen, rects)  # a tile may hold a light in one plane and noise in another
         for k in range(len(rects)):
-            more = tiles.candidates(
-                peak[p], level[p], sigma, spread[p], contrast, clipped, rects[k], seen, found[count:]
+            more = peaks.candidates(
+                peak[p],
+                level[p],
+                sigma,
+                spread[p],
+                q[fields.SIGNAL_NOISE] / scale,
+                contrast,
+                clipped,
+                peak if planes == 3 else peak[p : p + 1],
+                rects[k],
+                seen,
+                found[count:],
             )
             found[count : count + more, 4] = p
             count += more
     count = _most_outstanding(found, count, most[0])
     order = _brightest_first(image, planes, peak, int(clipped), found, count)
-    seen[:] = 0  # from here on: tiles of spots
+    tiles.clear(seen, rects)  # from here on: tiles of spots
     n, work = 0, most[1]
     side = patch.SIDE + 16
     window = (
@@ -66,7 +114,7 @@ def search(
         if seen[i, j]:
             continue
         p = int(found[k, 4])
-        v, u, is_peak = _peak_pixel(image, planes, p, i, j, peak[p, i, j] >= clipped)
+        v, u, is_peak = _peak_pixel(image, planes, p, i, j, peak[p, i, j] >= clipped, int(clipped))
         if not is_peak or seen[v // tiles.TILE_PX, u // tiles.TILE_PX]:
             continue
         noise = max(scale * sigma[i // tiles.BLOCK, j // tiles.BLOCK], q[fields.MIN_NOISE])
@@ -82,7 +130,7 @@ def search(
     return n
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _most_outstanding(found: Array, count: int, most: int) -> int:
     """Move the `most` candidates that stand out most to the front; returns how many there are."""
     if count <= most:
@@ -96,7 +144,7 @@ def _most_outstanding(found: Array, count: int, most: int) -> int:
     return kept
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _brightest_first(image: Image, planes: int, peak: Image, clipped: int, found: Array, count: int) -> Indices:
     """Order of the candidates by their tile's largest value; saturated ones by all channels of their brightest pixel.
 
@@ -107,25 +155,47 @@ def _brightest_first(image: Image, planes: int, peak: Image, clipped: int, found
         i, j, p = int(found[k, 0]), int(found[k, 1]), int(found[k, 4])
         key[k] = -1024.0 * peak[p, i, j]
         if planes == 3 and peak[p, i, j] >= clipped:
-            key[k] = -_brightest(image, planes, p, i, j)[2]
+            key[k] = -_highest_rank(image, p, i, j)
     return np.argsort(key, kind="mergesort")
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
+def _highest_rank(image: Image, p: int, i: int, j: int) -> int:
+    """Rank of the brightest pixel of a tile of three channels."""
+    best, left = 0, j * tiles.TILE_PX
+    right = min(left + tiles.TILE_PX, image.shape[1])
+    for v in range(i * tiles.TILE_PX, min((i + 1) * tiles.TILE_PX, image.shape[0])):
+        line = image[v, left:right]
+        for u in range(len(line)):
+            rank = 1024 * int(line[u, p]) + int(line[u, 0]) + int(line[u, 1]) + int(line[u, 2])
+            best = max(best, rank)
+    return best
+
+
+@njit(error_model="numpy")
 def _brightest(image: Image, planes: int, p: int, i: int, j: int) -> tuple[int, int, int]:
     """Row, column and rank of a tile's brightest pixel of a map."""
     best, row, column = -1, 0, 0
     top, left = i * tiles.TILE_PX, j * tiles.TILE_PX
+    step = 2 if planes == 4 else 1
     for v in range(top, min(top + tiles.TILE_PX, image.shape[0])):
-        for u in range(left, min(left + tiles.TILE_PX, image.shape[1])):
-            rank = _rank(image, planes, p, v, u)
+        first = left + ((p - v) & 1 if planes == 4 else 0)
+        if planes == 4 and p != 1 and v & 1 != p >> 1:
+            continue
+        line = image[v]
+        for u in range(first, min(left + tiles.TILE_PX, image.shape[1]), step):
+            rank = int(line[u, 0])
+            if planes == 3:
+                rank = 1024 * int(line[u, p]) + int(line[u, 0]) + int(line[u, 1]) + int(line[u, 2])
             if rank > best:
                 best, row, column = rank, v, u
     return row, column, best
 
 
-@njit(cache=True)
-def _peak_pixel(image: Image, planes: int, p: int, i: int, j: int, saturated: bool) -> tuple[int, int, bool]:
+@njit(error_model="numpy")
+def _peak_pixel(
+    image: Image, planes: int, p: int, i: int, j: int, saturated: bool, clipped: int
+) -> tuple[int, int, bool]:
     """Row and column of a tile's brightest pixel of a map, on a plateau of its middle.
 
     And whether it is a peak: none next to it, beyond the tile, is brighter.
@@ -137,15 +207,19 @@ def _peak_pixel(image: Image, planes: int, p: int, i: int, j: int, saturated: bo
             if _rank(image, planes, p, v, u) > best:
                 return row, column, False
     farthest = 64 if saturated else tiles.TILE_PX
+    least, most, white = best, _NO_LIMIT, (1027 if planes == 3 else 1) * clipped
+    if _rank(image, planes, p, row, column, clipped) == white:
+        # noise in what is clipped in every channel would cut the run short, and a core be measured from its rim
+        least, most = white, clipped
     for _ in range(2):
-        row = _middle_of_run(image, planes, p, row, column, 1, 0, best, farthest)
-        column = _middle_of_run(image, planes, p, row, column, 0, 1, best, farthest)
+        row = _middle_of_run(image, planes, p, row, column, 1, 0, least, most, farthest)
+        column = _middle_of_run(image, planes, p, row, column, 0, 1, least, most, farthest)
     return row, column, best > 0
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _middle_of_run(
-    image: Image, planes: int, p: int, v: int, u: int, dv: int, du: int, rank: int, farthest: int
+    image: Image, planes: int, p: int, v: int, u: int, dv: int, du: int, rank: int, most: int, farthest: int
 ) -> int:
     """Row or column in the middle of the run of pixels of at least this rank through a pixel, along one of both."""
     pitch = 2 if planes == 4 else 1
@@ -155,18 +229,24 @@ def _middle_of_run(
         k = pitch
         while k < farthest * pitch:
             y, x = v + sign * dv * k, u + sign * du * k
-            if not (0 <= y < image.shape[0] and 0 <= x < image.shape[1]) or _rank(image, planes, p, y, x) < rank:
+            if not (0 <= y < image.shape[0] and 0 <= x < image.shape[1]) or _rank(image, planes, p, y, x, most) < rank:
                 break
             k += pitch
         ends[side] = sign * (k - pitch)
     return (v if dv else u) + (ends[0] + ends[1]) // (2 * pitch) * pitch
 
 
-@njit(cache=True)
-def _rank(image: Image, planes: int, p: int, v: int, u: int) -> int:
-    """Order of a pixel in map `p`: by its value there, among equals by all channels, which tell a saturated core."""
-    if planes == 1:
-        return int(image[v, u, 0])
-    if planes == 4:
-        return int(image[v, u, 0]) if (v & 1) + (u & 1) == p else -1
-    return 1024 * int(image[v, u, p]) + int(image[v, u, 0]) + int(image[v, u, 1]) + int(image[v, u, 2])
+@njit(error_model="numpy")
+def _rank(image: Image, planes: int, p: int, v: int, u: int, most: int = _NO_LIMIT) -> int:
+    """Order of a pixel in map `p`: by its value there, among equals by all channels, which tell a saturated core.
+
+    Values over `most` count as it.
+    """
+    if planes == 4 and (v & 1) + (u & 1) != p:
+        return -1
+    if planes != 3:
+        return min(int(image[v, u, 0]), most)
+    rank = 1024 * min(int(image[v, u, p]), most)
+    for k in range(3):
+        rank += min(int(image[v, u, k]), most)
+    return rank

@@ -21,10 +21,11 @@ from __future__ import annotations
     P_LIGHT,
     VAR_UU,
     VAR_UV,
+    VAR_VU,
     VAR_VV,
     BY_LENS,
-) = range(17)
-COLUMNS = 17
+) = range(18)
+COLUMNS = 18
 # what may be tuned, see `DetectConfig`
 (
     CONTRAST,

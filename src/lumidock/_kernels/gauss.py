@@ -14,7 +14,7 @@ _LEFT = 0.3  # share of the degrees of freedom that a fit leaves at least
 _FITTED = 2.0  # of the residuals' degrees of freedom, that the position takes up where noise is not shared
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def fit(
     image: Image,
     planes: int,
@@ -44,7 +44,17 @@ def fit(
     parts, pitch = (4, 2) if planes == 4 else (1, 1)
     ex, ey = np.empty(right - left), np.empty(bottom - top)
     z = np.empty((bottom - top, right - left))
+    room = ((bottom - top + pitch - 1) // pitch) * ((right - left + pitch - 1) // pitch)
+    flat, used, g, a, b = (
+        np.empty((parts, room)),
+        np.empty((parts, room)),
+        np.empty(room),
+        np.empty(room),
+        np.empty(room),
+    )
     _read(image, planes, scale, weight, slope, left, top, u0, v0, clipped, z)
+    for p in range(parts):
+        _unroll(z[((p >> 1) - top) % pitch :: pitch, ((p & 1) - left) % pitch :: pitch], flat[p], used[p])
     u, v, s = center[0], center[1], width
     amplitude, ground = np.zeros(4), np.zeros(4)
     dx, dy = 1.0, 1.0
@@ -57,11 +67,13 @@ def fit(
         S[:], right_side[:] = 0.0, 0.0
         for p in range(parts):
             i0, j0 = ((p >> 1) - top) % pitch, ((p & 1) - left) % pitch
-            own, gx, gy = z[i0::pitch, j0::pitch], ex[j0::pitch], ey[i0::pitch]
-            used = amplitude[p] if turn > 0 else 0.0
-            amplitude[p], ground[p] = _amplitude(own, gx, gy, noise, signal_noise * max(used, 0.0))
             at = ((left + j0 - u) / s, (top + i0 - v) / s, pitch / s)
-            _add_equations(own, gx, gy, at, s, noise, signal_noise, amplitude[p], ground[p], S, right_side)
+            n = _profile(ex[j0::pitch], ey[i0::pitch], at, g, a, b)
+            own, valid, before = flat[p, :n], used[p, :n], amplitude[p] if turn > 0 else 0.0
+            amplitude[p], ground[p] = _amplitude(own, valid, g[:n], noise, signal_noise * max(before, 0.0))
+            _add_equations(
+                own, valid, g[:n], a[:n], b[:n], s, noise, signal_noise, amplitude[p], ground[p], S, right_side
+            )
         S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
         step, solved = _solve(S, right_side)
         if not solved:
@@ -87,7 +99,7 @@ def fit(
     return s
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def averaging(shared: float, width: float) -> float:
     """Variance of a centre by noise that neighbours share, over that by as much noise of each sample on its own.
 
@@ -96,7 +108,7 @@ def averaging(shared: float, width: float) -> float:
     return float(shared / (1.0 + (shared - 1.0) / (4.0 * np.pi * width * width)) ** 2)
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _read(
     image: Image,
     planes: int,
@@ -125,7 +137,7 @@ def _read(
                 z[i, j] = np.nan
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _misfit(
     z: Array,
     profile: tuple[Array, Array],
@@ -180,38 +192,59 @@ def _misfit(
     return max((_PRIOR_DOF + dof * total / weight) / (_PRIOR_DOF + max(dof - fitted, _LEFT * dof)), least / weight)
 
 
-@njit(cache=True)
-def _amplitude(z: Array, gx: Array, gy: Array, noise: float, signal_noise: float) -> tuple[float, float]:
-    """Least-squares amplitude and background of one plane under the present profile, samples of which are NaN left out.
+@njit(error_model="numpy")
+def _unroll(z: Array, flat: Array, used: Array) -> None:
+    """Write the samples of one plane row by row, 0 and not `used` where one is NaN."""
+    k = 0
+    for i in range(z.shape[0]):
+        for j in range(z.shape[1]):
+            bad = np.isnan(z[i, j])
+            flat[k], used[k] = (0.0, 0.0) if bad else (z[i, j], 1.0)
+            k += 1
+
+
+@njit(error_model="numpy")
+def _profile(ex: Array, ey: Array, at: tuple[float, float, float], g: Array, a: Array, b: Array) -> int:
+    """Write the profile `g` of one plane's samples, row by row, and their place `a`, `b` from the centre in widths.
+
+    `at`: the first sample's place along either axis, and the distance of two. Returns how many there are.
+    """
+    k, n = 0, len(ex)
+    for i in range(len(ey)):
+        e, y = ey[i], at[1] + at[2] * i
+        for j in range(n):
+            g[k + j], a[k + j], b[k + j] = ex[j] * e, at[0] + at[2] * j, y
+        k += n
+    return k
+
+
+@njit(error_model="numpy", fastmath={"reassoc", "contract"})
+def _amplitude(z: Array, used: Array, g: Array, noise: float, signal_noise: float) -> tuple[float, float]:
+    """Least-squares amplitude and background of one plane under the present profile, of the samples `used`.
 
     `signal_noise` is the variance that the profile adds to the noise's where it is 1.
     """
     gg, g1, n, gz, z1 = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(len(gy)):
-        row, b = z[i], gy[i]
-        for j in range(len(gx)):
-            value = row[j]
-            if np.isnan(value):
-                continue
-            g = gx[j] * b
-            w = 1.0 / (noise * noise + signal_noise * g)
-            gg += w * g * g
-            g1 += w * g
-            n += w
-            gz += w * g * value
-            z1 += w * value
+    for k in range(len(z)):
+        w = used[k] / (noise * noise + signal_noise * g[k])
+        gg += w * g[k] * g[k]
+        g1 += w * g[k]
+        n += w
+        gz += w * g[k] * z[k]
+        z1 += w * z[k]
     det = gg * n - g1 * g1
     if n > 0.0 and det > 1e-9 * gg * n:
         return (n * gz - g1 * z1) / det, (gg * z1 - g1 * gz) / det
     return 0.0, z1 / max(n, 1e-12)
 
 
-@njit(cache=True)
+@njit(error_model="numpy", fastmath={"reassoc", "contract"})
 def _add_equations(
     z: Array,
-    gx: Array,
-    gy: Array,
-    at: tuple[float, float, float],
+    used: Array,
+    profile: Array,
+    a: Array,
+    b: Array,
     s: float,
     noise: float,
     signal_noise: float,
@@ -222,42 +255,37 @@ def _add_equations(
 ) -> None:
     """Add one plane to the upper triangle of the Schur complement `S` (3, 3) of position and width, and to its side.
 
-    `at`: the first sample's distance from the centre along either axis, and that of two samples, in widths.
+    `profile`, `a` and `b` of its samples: see `_profile`.
     """
-    a0, b0, pitch = at
     s00, s01, s02, s11, s12, s22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     r0, r1, r2 = 0.0, 0.0, 0.0
     gg, g1, n = 0.0, 0.0, 0.0
     g_j0, g_j1, g_j2, j_0, j_1, j_2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(len(gy)):
-        row, b, e = z[i], b0 + pitch * i, gy[i]
-        for j in range(len(gx)):
-            value = row[j]
-            if np.isnan(value):
-                continue
-            g, a = gx[j] * e, a0 + pitch * j
-            w = 1.0 / (noise * noise + signal_noise * max(amplitude, 0.0) * g)
-            d = amplitude * g / s
-            j0, j1, j2 = d * a, d * b, d * (a * a + b * b)
-            wr, w0, w1, w2, wg = w * (value - ground - amplitude * g), w * j0, w * j1, w * j2, w * g
-            s00 += w0 * j0
-            s01 += w0 * j1
-            s02 += w0 * j2
-            s11 += w1 * j1
-            s12 += w1 * j2
-            s22 += w2 * j2
-            r0 += wr * j0
-            r1 += wr * j1
-            r2 += wr * j2
-            gg += wg * g
-            g1 += wg
-            n += w
-            g_j0 += wg * j0
-            g_j1 += wg * j1
-            g_j2 += wg * j2
-            j_0 += w0
-            j_1 += w1
-            j_2 += w2
+    shot, per_width = signal_noise * max(amplitude, 0.0), amplitude / s
+    for k in range(len(z)):
+        g = profile[k]
+        w = used[k] / (noise * noise + shot * g)
+        d = per_width * g
+        j0, j1, j2 = d * a[k], d * b[k], d * (a[k] * a[k] + b[k] * b[k])
+        wr, w0, w1, w2, wg = w * (z[k] - ground - amplitude * g), w * j0, w * j1, w * j2, w * g
+        s00 += w0 * j0
+        s01 += w0 * j1
+        s02 += w0 * j2
+        s11 += w1 * j1
+        s12 += w1 * j2
+        s22 += w2 * j2
+        r0 += wr * j0
+        r1 += wr * j1
+        r2 += wr * j2
+        gg += wg * g
+        g1 += wg
+        n += w
+        g_j0 += wg * j0
+        g_j1 += wg * j1
+        g_j2 += wg * j2
+        j_0 += w0
+        j_1 += w1
+        j_2 += w2
     S[0, 0] += s00
     S[0, 1] += s01
     S[0, 2] += s02
@@ -277,7 +305,7 @@ def _add_equations(
             S[k, m] -= (n * of_g[k] * of_g[m] - g1 * mixed + gg * of_1[k] * of_1[m]) / det
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _solve(S: Array, b: Array) -> tuple[Array, bool]:
     """Solution (3,) of S x = b by the adjugate."""
     c0 = S[1, 1] * S[2, 2] - S[1, 2] * S[2, 1]
@@ -299,7 +327,7 @@ def _solve(S: Array, b: Array) -> tuple[Array, bool]:
     return x, True
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _top_left_of_inverse(S: Array) -> tuple[tuple[float, float, float], bool]:
     """The entries uu, uv, vv of the inverse of S (3, 3)."""
     a = S[0, 0] - S[0, 2] ** 2 / S[2, 2]

@@ -11,7 +11,7 @@ from lumidock.datatypes import Array
 _LOG_BAD_PIXEL = -2.3  # prior log odds that a small spot is a bad pixel
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def lamp_probability(spot: Array, q: Array) -> float:
     """Probability of being a lamp, from contrast, shape, size and blur: soft, so that geometry can overrule it."""
     radius = spot[fields.RADIUS]
@@ -28,12 +28,12 @@ def lamp_probability(spot: Array, q: Array) -> float:
     return float(min(max(seen * shape * size * alone * blurred, 0.02), 0.98))
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _logistic(x: float) -> float:
     return float(1.0 / (1.0 + np.exp(-x)))
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def dim_glints(spots: Array, n: int, q: Array) -> None:
     """Make little of a spot near a much stronger one that may be a lamp: its reflection on the frame beside it."""
     before = spots[:n, fields.P_LIGHT].copy()
@@ -53,7 +53,7 @@ def dim_glints(spots: Array, n: int, q: Array) -> None:
                 break
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def dim_small_fry(spots: Array, n: int, q: Array) -> None:
     """Make less of spots that are many of a kind, or faint beside the lamps in view.
 

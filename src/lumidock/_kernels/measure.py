@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lumidock._kernels import fields, patch, samples, tiles
+from lumidock._kernels import fields, patch, peaks, samples, tiles
 from lumidock._kernels.describe import FILTER_PX, describe, index, peak_value, small_snr
 from lumidock._kernels.patch import Window
 from lumidock.datatypes import Array, Image, Indices
@@ -21,7 +21,7 @@ _MOST_SHARED = 36.0  # samples over which noise is the same; more is a texture
 _LEAST_STEP = 30.0  # levels by which a saturated light stands out in the plane that shows it best
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def measure(
     image: Image,
     planes: int,
@@ -113,7 +113,7 @@ def measure(
     return int(describe(image, planes, scale, weight, window, where, start, u, v, part, ground, shared, q, spots, n))
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _extent(peak: Image, i: int, j: int, level: Array) -> float:
     """Radius px that the tiles give a spot at half height: of its narrower side, half a tile at least.
 
@@ -126,7 +126,7 @@ def _extent(peak: Image, i: int, j: int, level: Array) -> float:
             p, most = k, over
     step = 0
     for far in (4, 8, 16):
-        step = max(step, tiles.over_pairs(peak[p], i, j, far))
+        step = max(step, peaks.over_pairs(peak[p], i, j, far))
     half = float(peak[p, i, j]) - 0.5 * min(most, 0.5 * step)
     width, height = 1, 1
     for step in (-1, 1):
@@ -141,7 +141,7 @@ def _extent(peak: Image, i: int, j: int, level: Array) -> float:
     return 0.5 * tiles.TILE_PX * min(width, height)
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _level(
     image: Image,
     planes: int,
@@ -185,7 +185,7 @@ def _level(
     return 0.0
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _holds_another(stamp: Image, where: Array, mark: int, spots: Array, n: int) -> bool:
     """Whether the grown region covers the centre of a spot found before."""
     for k in range(n):
@@ -196,23 +196,28 @@ def _holds_another(stamp: Image, where: Array, mark: int, spots: Array, n: int) 
     return False
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _own(seen: Image, stamp: Image, where: Array, start: Indices) -> None:
     """Mark the tiles that the grown region touches: nobody looks there again."""
     mark, t = stamp[start[1], start[0]], tiles.TILE_PX
-    unit = int(where[patch.UNIT])
+    unit, columns = int(where[patch.UNIT]), int(where[patch.COLUMNS])
     for y in range(int(where[patch.ROWS])):
+        line, x = stamp[y], 0
         top = int(where[patch.TOP]) + y * unit
-        for x in range(int(where[patch.COLUMNS])):
-            if stamp[y, x] == mark:
-                left = int(where[patch.LEFT]) + x * unit
-                for i in range(top // t, (top + unit - 1) // t + 1):
-                    for j in range(left // t, (left + unit - 1) // t + 1):
-                        if i < seen.shape[0] and j < seen.shape[1]:
-                            seen[i, j] = 1
+        last_row = min((top + unit - 1) // t + 1, seen.shape[0])
+        while x < columns:
+            if line[x] != mark:
+                x += 1
+                continue
+            first = x
+            while x < columns and line[x] == mark:
+                x += 1
+            left, right = int(where[patch.LEFT]) + first * unit, int(where[patch.LEFT]) + x * unit - 1
+            for i in range(top // t, last_row):
+                seen[i, left // t : min(right // t + 1, seen.shape[1])] = 1
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _own_plateau(
     image: Image,
     planes: int,

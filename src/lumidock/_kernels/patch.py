@@ -24,7 +24,7 @@ LEFT, TOP, UNIT, COLUMNS, ROWS, SLOPE_U, SLOPE_V = range(7)
 Window = tuple[Array, NDArray[np.int16], NDArray[np.int32], Array]
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def cut(
     image: Image,
     planes: int,
@@ -72,7 +72,7 @@ def cut(
                 out[j] = w0 * even[x] + w1 * even[z] + w2 * odd[x] + w3 * odd[z]
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tuple[float, float, float]:
     """Level, spread and unevenness (1 sigma) of the ring of `radius` around a sample, without its slope.
 
@@ -125,28 +125,26 @@ def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tu
     return level, spread, _ROOT_TWO * uneven[pairs // 2] / 0.674
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def smooth(patch: Array, where: Array) -> None:
     """Average with the neighbours by 1 2 1 in either direction: a clipped core is torn by noise, and by interlacing."""
     columns, rows = int(where[COLUMNS]), int(where[ROWS])
+    before = np.empty(columns + 2)
     for i in range(rows):
-        before = patch[i, 0]
-        for j in range(columns - 1):
-            here = patch[i, j]
-            patch[i, j] = 0.25 * (before + 2.0 * here + patch[i, j + 1])
-            before = here
-        patch[i, columns - 1] = 0.25 * (before + 3.0 * patch[i, columns - 1])
-    above = patch[0, :columns].copy()
-    for i in range(rows - 1):
+        line = patch[i, :columns]
+        before[0], before[1 : columns + 1], before[columns + 1] = line[0], line, line[columns - 1]
         for j in range(columns):
-            here = patch[i, j]
-            patch[i, j] = 0.25 * (above[j] + 2.0 * here + patch[i + 1, j])
+            line[j] = 0.25 * (before[j] + 2.0 * before[j + 1] + before[j + 2])
+    above = patch[0, :columns].copy()
+    for i in range(rows):
+        line, below = patch[i, :columns], patch[min(i + 1, rows - 1), :columns]
+        for j in range(columns):
+            here = line[j]
+            line[j] = 0.25 * (above[j] + 2.0 * here + below[j])
             above[j] = here
-    for j in range(columns):
-        patch[rows - 1, j] = 0.25 * (above[j] + 3.0 * patch[rows - 1, j])
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def rim_noise(patch: Array, where: Array) -> float:
     """1 sigma of a sample, from second differences along the outer rows of a window; large ones, of edges, left out."""
     columns, rows = int(where[COLUMNS]), int(where[ROWS])
@@ -166,7 +164,7 @@ def rim_noise(patch: Array, where: Array) -> float:
     return sigma
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def filtered(patch: Array, where: Array, x: float, y: float, width: float, level: float) -> tuple[float, float]:
     """Amplitude of a Gaussian of `width` samples at a place, and how many samples' worth of averaging is in it."""
     reach = int(np.ceil(2.5 * width))
@@ -180,7 +178,7 @@ def filtered(patch: Array, where: Array, x: float, y: float, width: float, level
     return total / power, power
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def grow(window: Window, where: Array, image: Image, x: int, y: int, level: float, clipped: float, mark: int) -> None:
     """Sum up the connected samples over `level` around one, coordinates relative to it, into the window's sums.
 
@@ -193,35 +191,72 @@ def grow(window: Window, where: Array, image: Image, x: int, y: int, level: floa
     at_bottom = where[TOP] + where[UNIT] * rows >= image.shape[0] - 1
     sums[:] = 0.0
     stack[0, 0], stack[0, 1] = x, y
-    stamp[y, x] = mark
+    stamp[y, x] = 0
     top = 1
-    while top:
+    while top:  # a run of one row at a time
         top -= 1
-        j, i = stack[top, 0], stack[top, 1]
-        a, b, weight = float(j - x), float(i - y), patch[i, j] - level
-        sums[N] += 1.0
-        sums[X] += a
-        sums[Y] += b
-        sums[XX] += a * a
-        sums[XY] += a * b
-        sums[YY] += b * b
-        sums[W] += weight
-        sums[WX] += weight * a
-        sums[WY] += weight * b
-        sums[CLIPPED] += patch[i, j] >= clipped
-        if j == 0 or i == 0 or j == columns - 1 or i == rows - 1:
-            cut_off = (j == 0 and at_left) or (i == 0 and at_top)
-            cut_off = cut_off or (j == columns - 1 and at_right) or (i == rows - 1 and at_bottom)
-            sums[EDGE if cut_off else OPEN] += 1.0
-        for k in range(4):
-            c, d = j + (k == 0) - (k == 1), i + (k == 2) - (k == 3)
-            if 0 <= c < columns and 0 <= d < rows and stamp[d, c] != mark and patch[d, c] > level:
-                stamp[d, c] = mark
-                stack[top, 0], stack[top, 1] = c, d
-                top += 1
+        first, i = stack[top, 0], stack[top, 1]
+        line, mine = patch[i], stamp[i]
+        if mine[first] == mark:
+            continue
+        last = first + 1
+        while first > 0 and line[first - 1] > level:
+            first -= 1
+        while last < columns and line[last] > level:
+            last += 1
+        _add_run(line[first:last], float(first - x), float(i - y), level, clipped, sums)
+        mine[first:last] = mark
+        if i == 0 or i == rows - 1:
+            sums[EDGE if (at_top if i == 0 else at_bottom) else OPEN] += last - first
+        else:
+            for end, at_end in ((first == 0, at_left), (last == columns, at_right)):
+                if end:
+                    sums[EDGE if at_end else OPEN] += 1.0
+        for d in (i - 1, i + 1):
+            new = _unmarked(patch[d, first:last], stamp[d, first:last], level, mark) if 0 <= d < rows else 0
+            for c in range(first, last if new else first):
+                if patch[d, c] > level and stamp[d, c] != mark:
+                    if c == first or not (patch[d, c - 1] > level and stamp[d, c - 1] != mark):
+                        stack[top, 0], stack[top, 1] = c, d
+                        top += 1
+                    if new == last - first:  # all of it is one run
+                        break
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
+def _unmarked(values: Array, stamp: Image, level: float, mark: int) -> int:
+    """How many of some samples are over the level and not marked yet."""
+    count = 0
+    for k in range(len(values)):
+        count += (values[k] > level) & (stamp[k] != mark)
+    return count
+
+
+@njit(error_model="numpy", fastmath={"reassoc", "contract"})
+def _add_run(values: Array, a: float, b: float, level: float, clipped: float, sums: Array) -> None:
+    """Add samples of one row, the first at `a`, `b`, to the sums of a region."""
+    n, x, xx, w, wx, burnt = float(len(values)), 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(len(values)):
+        weight = values[k] - level
+        x += a
+        xx += a * a
+        w += weight
+        wx += weight * a
+        burnt += values[k] >= clipped
+        a += 1.0
+    sums[N] += n
+    sums[X] += x
+    sums[Y] += n * b
+    sums[XX] += xx
+    sums[XY] += x * b
+    sums[YY] += n * b * b
+    sums[W] += w
+    sums[WX] += wx
+    sums[WY] += w * b
+    sums[CLIPPED] += burnt
+
+
+@njit(error_model="numpy")
 def fields_apart(window: Window, where: Array, start: Indices, level: float) -> tuple[float, float]:
     """How far the centre by even rows lies from that by odd rows, px: the way between the fields of interlaced video.
 
@@ -245,7 +280,7 @@ def fields_apart(window: Window, where: Array, start: Indices, level: float) -> 
     return total[0, 1] / total[0, 0] - total[1, 1] / total[1, 0], total[0, 2] / total[0, 0] - total[1, 2] / total[1, 0]
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def shape(sums: Array) -> tuple[float, float]:
     """Ratio of the axes of the ellipse with the region's second moments, and the region's area over the ellipse's."""
     n = sums[N]
@@ -255,7 +290,7 @@ def shape(sums: Array) -> tuple[float, float]:
     return np.sqrt(max(half - turn, 1e-12) / (half + turn)), n / area
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def moments(sums: Array) -> tuple[float, float, float]:
     """Second central moments of the region, of samples that are unit squares."""
     n = sums[N]
@@ -264,7 +299,7 @@ def moments(sums: Array) -> tuple[float, float, float]:
     return uu, (sums[XY] - sums[X] * sums[Y] / n) / n, vv
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def balance(sums: Array, variance: float, center: Array, cov: Array) -> None:
     """Write a region's weighted centre (2,), relative to its start, and its covariance (3,) by noise of `variance`."""
     x, y = sums[WX] / sums[W], sums[WY] / sums[W]

@@ -16,7 +16,7 @@ _ROOT_TWO = np.sqrt(2.0)
 _LEAST_LOST, _SLACK = 0.4, 0.5  # share of its height that a spot loses to the ring; sigmas of noise left to it
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def sample(image: Image, planes: int, p: int, v: int, u: int) -> float:
     """One sample of plane `p` at pixel or, on a mosaic, in the 2 x 2 cell of a pixel."""
     if planes == 1:
@@ -26,7 +26,7 @@ def sample(image: Image, planes: int, p: int, v: int, u: int) -> float:
     return float(image[min((v & -2) + (p >> 1), image.shape[0] - 1), min((u & -2) + (p & 1), image.shape[1] - 1), 0])
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def core_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int) -> float:
     """Mean of a plane over 3 x 3 of its samples around a pixel."""
     pitch = 2 if planes == 4 else 1
@@ -38,7 +38,7 @@ def core_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int) -
     return scale * total / count
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def ring_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float) -> float:
     """Mean of the second quarter of twelve samples of a plane on a circle around a pixel, 0 where it is outside.
 
@@ -54,7 +54,7 @@ def ring_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int, r
     return float(scale * ordered[count // 4 : count // 2 + 1].mean())
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def log_lens_over_bad_pixel(
     image: Image, planes: int, scale: float, v: int, u: int, radius: float, share: float, noise: float
 ) -> float:
@@ -79,7 +79,7 @@ def log_lens_over_bad_pixel(
     return held * (around - 0.5 * held) * 8.0 / noise**2
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def stands_out(
     image: Image,
     planes: int,
@@ -108,7 +108,7 @@ def stands_out(
     return not whole or core - level + _SLACK * noise >= _LEAST_LOST * (core - far)
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _pair_level(
     image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float
 ) -> tuple[float, float, bool]:
@@ -123,7 +123,7 @@ def _pair_level(
     return means[1:5].mean(), _ROOT_TWO * (means[4] - means[1]) / 1.35, True
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def weigh(image: Image, planes: int, scale: float, v: int, u: int, radius: float, weight: Array) -> None:
     """Write each plane's `weight` (4,), their sum 1, for a light of about `radius` px at a pixel.
 
@@ -142,7 +142,7 @@ def weigh(image: Image, planes: int, scale: float, v: int, u: int, radius: float
     weight /= total
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def weigh_clipped(
     image: Image, planes: int, scale: float, v: int, u: int, least: float, largest: float, weight: Array
 ) -> float:
@@ -152,14 +152,16 @@ def weigh_clipped(
     first ring at half height over the ring three times as wide; a plane must stand out by `least`.
     """
     weight[:] = 0.0
-    radii = np.full(4, np.inf)
-    for p in range(planes):
+    radii, most = np.full(4, np.inf), largest
+    for p in range(planes - 1, -1, -1):
         top, radius = core_mean(image, planes, scale, p, v, u), 3.0
-        while radius < largest:
-            dark = ring_mean(image, planes, scale, p, v, u, 3.0 * radius)
-            if top - dark >= least and ring_mean(image, planes, scale, p, v, u, radius) <= 0.5 * (top + dark):
-                radii[p] = radius
-                break
+        while radius < most:
+            here = ring_mean(image, planes, scale, p, v, u, radius)
+            if here <= top - 0.5 * least:  # else it is over half height whatever the background
+                dark = ring_mean(image, planes, scale, p, v, u, 3.0 * radius)
+                if top - dark >= least and here <= 0.5 * (top + dark):
+                    radii[p], most = radius, min(1.3 * radius + 1e-6, most)
+                    break
             radius *= 1.25
     smallest = radii.min()
     if not np.isfinite(smallest):
@@ -170,7 +172,7 @@ def weigh_clipped(
     return float(smallest)
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def insert(ordered: Array, count: int, value: float) -> int:
     """Insert into the first `count` of the sorted values; returns the new count."""
     k = count

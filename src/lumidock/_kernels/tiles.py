@@ -1,172 +1,196 @@
-"""The one pass over a frame: largest value of every 8 x 8 tile, local noise, and the tiles worth a closer look.
+"""The one pass over a frame: largest value of every 8 x 8 tile, local background and noise, and windows of tiles.
 
 Rows are (H, W * channels) of an unsigned type.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lumidock._kernels import fields
 from lumidock.datatypes import Array, Image, Indices
 
 TILE_PX, BLOCK = 8, 8  # pixels a side of a tile, tiles a side of a block
 SPARSE = 4  # one block in so many says how samples share their noise
-_FAR = 4  # tiles at which the slopes of a wide light show
 _SIGMA = 0.5117  # of the mean absolute second difference of normal noise: sqrt(pi / 12)
 
 
-@njit(cache=True)
-def refresh(rows: Image, planes: int, rect: Indices, peak: Image, line: Image) -> None:
+class Map(NamedTuple):
+    """What is known of a camera's tiles (h, w) and blocks (hb, wb), in P planes, and scratch.
+
+    `peak` (P, h, w) largest values of the tiles; of the blocks `raw_level` (P, hb, wb), `raw_sigma` (hb, wb) and
+    `by_plane` (2, P, hb, wb / 4), see `survey`; from these `level`, `sigma`, `spread` (P,) and `shared` (4,), see
+    `settle`. Scratch: `line` (3, n), n = 8 w times the channels; `seen` (h, w); `found` (N, 5).
+    """
+
+    peak: Image
+    raw_level: Image
+    raw_sigma: Array
+    by_plane: Array
+    level: Array
+    sigma: Array
+    spread: Array
+    shared: Array
+    line: Image
+    seen: Image
+    found: Array
+
+
+@njit(error_model="numpy")
+def refresh(rows: Image, planes: int, rect: Indices, step: int, peak: Image, line: Image) -> None:
     """Write the largest values of each tile of `rect` into `peak` (P, h, w); `rect` is two rows and two columns.
 
     One map for mono; for `planes` 3 one for each channel; for a mosaic, `planes` 4, the corners of its 2 x 2 cell that
     stand on one diagonal are one map if they are alike, so that there are three: a light in one colour must not hide
-    behind the background of another. `line` (2, n) is scratch, n = (W + 16) times the channels.
+    behind the background of another. Where the greens are the first and fourth corner, the maps mix colours, and lose
+    only sharpness. Only every `step`th row is looked at, of a mosaic every `step`th pair. `line`: see `Map`.
     """
-    height = len(rows)
     channels = 3 if planes == 3 else 1
-    span = TILE_PX * channels
-    left, right = rect[2] * span, min(rect[3] * span, rows.shape[1])
-    n, padded = right - left, (rect[3] - rect[2]) * span
+    left, right = rect[2] * TILE_PX * channels, min(rect[3] * TILE_PX * channels, rows.shape[1])
+    n, padded = right - left, (rect[3] - rect[2]) * TILE_PX * channels
+    even, odd, most = line[0, :padded], line[1, :padded], line[2, :padded]
+    even[n:], odd[n:] = 0, 0
     for i in range(rect[0], rect[1]):
-        part = rows[i * TILE_PX : min((i + 1) * TILE_PX, height), left:right]
-        line[:, n:padded] = 0
+        top = i * TILE_PX
         if planes == 4:
-            _max_of_rows(part[0::2], line[0, :n])
-            _max_of_rows(part[1::2] if len(part) > 1 else part, line[1, :n])
-            _largest_of_mosaic(line[0, :padded], line[1, :padded], peak[:, i, rect[2] : rect[3]])
+            _max_of_four(rows, top, 0, step, left, even[:n])
+            _max_of_four(rows, top, 1, step, left, odd[:n])
+            a, b = peak[0, i, rect[2] : rect[3]], peak[1, i, rect[2] : rect[3]]
+            c = peak[2, i, rect[2] : rect[3]]
+            _largest_of_corner(even, 0, a)
+            _largest_of_corner(even, 1, b)
+            _largest_of_corner(odd, 0, c)
+            for j in range(len(b)):
+                b[j] = max(b[j], c[j])
+            _largest_of_corner(odd, 1, c)
             continue
-        if len(part) == TILE_PX:
-            _max_of_eight(part, line[0, :n])
+        if step == 1:
+            _max_of_eight(rows, top, left, even[:n])
         else:
-            _max_of_rows(part, line[0, :n])
+            _max_of_four(rows, top, 0, 1, left, even[:n])
         if channels == 1:
-            _largest_of_tiles(line[0, :padded], peak[0, i, rect[2] : rect[3]])
+            _largest_of_tiles(even, peak[0, i, rect[2] : rect[3]])
         else:
-            _largest_of_wide_tiles(line[0, :padded], line[1, :padded], peak[:, i, rect[2] : rect[3]])
+            _largest_of_wide_tiles(even, most, peak, i, rect[2])
 
 
-@njit(cache=True)
-def _max_of_eight(r: Image, line: Image) -> None:
-    a, b, c, d, e, f, g, h = r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7]
+@njit(error_model="numpy")
+def _row(rows: Image, top: int, k: int) -> int:
+    """Row `k` of a tile, or one of its own kind where the picture ends before it."""
+    return top + k if top + k < len(rows) else top + (k & 1 if top + 1 < len(rows) else 0)
+
+
+@njit(error_model="numpy")
+def _max_of_eight(rows: Image, top: int, left: int, line: Image) -> None:
+    right = left + len(line)
+    a, b = rows[top, left:right], rows[_row(rows, top, 1), left:right]
+    c, d = rows[_row(rows, top, 2), left:right], rows[_row(rows, top, 3), left:right]
+    e, f = rows[_row(rows, top, 4), left:right], rows[_row(rows, top, 5), left:right]
+    g, h = rows[_row(rows, top, 6), left:right], rows[_row(rows, top, 7), left:right]
     for x in range(len(line)):
         line[x] = max(max(max(a[x], b[x]), max(c[x], d[x])), max(max(e[x], f[x]), max(g[x], h[x])))
 
 
-@njit(cache=True)
-def _max_of_rows(rows: Image, line: Image) -> None:
-    if len(rows) == 4:
-        a, b, c, d = rows[0], rows[1], rows[2], rows[3]
+@njit(error_model="numpy")
+def _max_of_four(rows: Image, top: int, first: int, step: int, left: int, line: Image) -> None:
+    """The larger of every second row of a tile from `first` on; of every fourth with `step` 2."""
+    right = left + len(line)
+    a, b = rows[_row(rows, top, first), left:right], rows[_row(rows, top, first + 4), left:right]
+    if step == 2:
         for x in range(len(line)):
-            line[x] = max(max(a[x], b[x]), max(c[x], d[x]))
+            line[x] = max(a[x], b[x])
         return
-    line[:] = rows[0]
-    for v in range(1, len(rows)):
-        _larger(line, rows[v], line)
+    c, d = rows[_row(rows, top, first + 2), left:right], rows[_row(rows, top, first + 6), left:right]
+    for x in range(len(line)):
+        line[x] = max(max(a[x], b[x]), max(c[x], d[x]))
 
 
-@njit(cache=True)
-def _larger(a: Image, b: Image, out: Image) -> None:
-    for x in range(len(out)):
-        out[x] = max(a[x], b[x])
-
-
-@njit(cache=True)
+@njit(error_model="numpy")
 def _largest_of_tiles(line: Image, out: Image) -> None:
     for j in range(len(out)):
-        highest = line[TILE_PX * j]
+        largest = line[TILE_PX * j]
         for k in range(1, TILE_PX):
-            value = line[TILE_PX * j + k]
-            highest = value if value > highest else highest
-        out[j] = highest
+            largest = max(largest, line[TILE_PX * j + k])
+        out[j] = largest
 
 
-@njit(cache=True)
-def _largest_of_mosaic(even: Image, odd: Image, out: Image) -> None:
-    """The largest of the four corners of a cell, the second and third as one: the greens of most mosaics.
-
-    Where the greens are the first and fourth, the maps mix colours, and lose only sharpness.
-    """
-    for j in range(out.shape[1]):
-        x = TILE_PX * j
-        out[0, j] = max(max(even[x], even[x + 2]), max(even[x + 4], even[x + 6]))
-        a = max(max(even[x + 1], even[x + 3]), max(even[x + 5], even[x + 7]))
-        b = max(max(odd[x], odd[x + 2]), max(odd[x + 4], odd[x + 6]))
-        out[1, j] = max(a, b)
-        out[2, j] = max(max(odd[x + 1], odd[x + 3]), max(odd[x + 5], odd[x + 7]))
+@njit(error_model="numpy")
+def _largest_of_corner(line: Image, first: int, out: Image) -> None:
+    """The largest of every second value of each tile."""
+    for j in range(len(out)):
+        x = TILE_PX * j + first
+        out[j] = max(max(line[x], line[x + 2]), max(line[x + 4], line[x + 6]))
 
 
-@njit(cache=True)
-def _largest_of_wide_tiles(line: Image, scratch: Image, out: Image) -> None:
-    """The same for three channels: each halving is one run along the whole line."""
-    n = len(line) - 12
-    _larger(line[:n], line[12:], scratch[:n])
-    _larger(scratch[: n - 6], scratch[6:n], line[: n - 6])
-    _larger(line[: n - 9], line[3 : n - 6], scratch[: n - 9])
-    for j in range(out.shape[1]):
+@njit(error_model="numpy")
+def _largest_of_wide_tiles(line: Image, most: Image, peak: Image, i: int, left: int) -> None:
+    """The same for three channels: the largest of eight pixels from each value on, in one run, then those of tiles."""
+    n = len(line) - 21
+    for x in range(n):
+        a, b = max(line[x], line[x + 3]), max(line[x + 6], line[x + 9])
+        c, d = max(line[x + 12], line[x + 15]), max(line[x + 18], line[x + 21])
+        most[x] = max(max(a, b), max(c, d))
+    tiles = len(line) // (3 * TILE_PX)
+    a, b = peak[0, i, left : left + tiles], peak[1, i, left : left + tiles]
+    c = peak[2, i, left : left + tiles]
+    for j in range(tiles):
         x = 3 * TILE_PX * j
-        out[0, j], out[1, j], out[2, j] = scratch[x], scratch[x + 1], scratch[x + 2]
+        a[j], b[j], c[j] = most[x], most[x + 1], most[x + 2]
 
 
-@njit(cache=True)
-def survey(
-    rows: Image,
-    planes: int,
-    blocks: tuple[int, int],
-    peak: Image,
-    line: Image,
-    level: Image,
-    sigma: Array,
-    by_plane: Array,
-) -> None:
-    """Bring the rows of blocks from `blocks[0]` to `blocks[1]` up to date.
+@njit(error_model="numpy")
+def survey(rows: Image, planes: int, blocks: tuple[int, int], step: int, known: Map) -> None:
+    """Bring the rows of blocks from `blocks[0]` to `blocks[1]` up to date, by every `step`th row of pixels.
 
-    That is `peak` of their tiles (P, h, w), and of blocks
-    `level` (P, h, w), the median of their tiles, `sigma` (h, w), the noise of a sample, and `by_plane` (2, P, h, w /
-    4).
-
-    That is the noise of each plane, and what the sums of eight neighbours make of it over the root of eight:
-    demosaicing and JPEG share noise. One row of pixels speaks for a row of blocks, by second differences, which no
-    slope reaches, of every other pixel, which a mosaic does not.
+    That is `peak` of their tiles, and of blocks `raw_level`, the median of their tiles, `raw_sigma`, the noise of a
+    sample, and `by_plane`, the noise of each plane, and what the sums of eight neighbours make of it over the root of
+    eight: demosaicing and JPEG share noise. One row of pixels speaks for a row of blocks, by second differences, which
+    no slope reaches, of every other pixel, which a mosaic does not.
     """
+    peak = known.peak
     rect = np.array([0, 0, 0, peak.shape[2]])
-    difference = np.zeros((2, rows.shape[1]), np.int32)
+    difference = np.empty((2, rows.shape[1]), np.int32)
     for b in range(blocks[0], blocks[1]):
         rect[0], rect[1] = b * BLOCK, min((b + 1) * BLOCK, peak.shape[1])
-        refresh(rows, planes, rect, peak, line)
+        refresh(rows, planes, rect, step, peak, known.line)
         for p in range(len(peak)):
-            _levels(peak[p], b, level[p])
+            _levels(peak[p], b, known.raw_level[p])
         v = min(b * BLOCK * TILE_PX + 3 * TILE_PX, (len(rows) - 2) & -2)
-        _noise(rows[v], rows[v + 1], planes, difference, sigma[b], by_plane[:, :, b])
+        _noise(rows[v], rows[v + 1], planes, difference, known.raw_sigma[b], known.by_plane[:, :, b])
 
 
-@njit(cache=True)
-def revisit(rows: Image, planes: int, rects: Indices, peak: Image, line: Image) -> None:
-    """Bring the tiles of some windows `rects` (n, 4) up to date."""
+@njit(error_model="numpy")
+def clear(seen: Image, rects: Indices) -> None:
+    """Forget that tiles of some windows `rects` (n, 4) were seen."""
     for k in range(len(rects)):
-        refresh(rows, planes, rects[k], peak, line)
+        for i in range(rects[k, 0], rects[k, 1]):
+            seen[i, rects[k, 2] : rects[k, 3]] = 0
 
 
-@njit(cache=True)
-def windows(expected: Array, seen: Array, drift_px: float, h: int, w: int, rects: Indices) -> int:
-    """Write the tiles, `rects` (n, 4), around the `expected` places (n, 3), u, v and reach px, and those `seen` last.
+@njit(error_model="numpy")
+def windows(expected: Array, before: Array, drift_px: float, h: int, w: int, rects: Indices) -> int:
+    """Write the tiles, `rects` (n, 4), around the `expected` places (n, 3), u, v and reach px, and the spots `before`.
 
-    Of these u, v and radius; what lies in a window already gets none of its own. Returns how many there are.
+    A spot well inside a window gets none of its own. Returns how many there are.
     """
     count = 0
-    for k in range(len(expected) + len(seen)):
+    for k in range(len(expected) + len(before)):
         if k < len(expected):
             u, v, reach = expected[k, 0], expected[k, 1], expected[k, 2]
         else:
-            u, v = seen[k - len(expected), 0], seen[k - len(expected), 1]
-            reach = 2.0 * seen[k - len(expected), 2] + drift_px
+            spot = before[k - len(expected)]
+            u, v, reach = spot[fields.U], spot[fields.V], 2.0 * spot[fields.RADIUS] + drift_px
         top, bottom = _clip((v - reach) / TILE_PX, h), _clip((v + reach) / TILE_PX + 1.0, h)
         left, right = _clip((u - reach) / TILE_PX, w), _clip((u + reach) / TILE_PX + 1.0, w)
         known = top >= bottom or left >= right
+        i, j = int(v) // TILE_PX, int(u) // TILE_PX
         for m in range(count):
             r = rects[m]
+            known |= k >= len(expected) and r[0] < i < r[1] - 1 and r[2] < j < r[3] - 1
             known |= r[0] <= top and bottom <= r[1] and r[2] <= left and right <= r[3]
         if not known:
             rects[count, 0], rects[count, 1], rects[count, 2], rects[count, 3] = top, bottom, left, right
@@ -174,12 +198,12 @@ def windows(expected: Array, seen: Array, drift_px: float, h: int, w: int, rects
     return count
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _clip(x: float, most: int) -> int:
     return int(min(max(x, 0.0), float(most)))
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def area(rects: Indices) -> int:
     """Tiles in all windows together, those in several counted as often."""
     total = 0
@@ -188,7 +212,7 @@ def area(rects: Indices) -> int:
     return total
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _noise(even: Image, odd: Image, planes: int, difference: NDArray[np.int32], sigma: Array, by_plane: Array) -> None:
     """The noise of one row of blocks, from an even and, of a mosaic, an odd row of pixels, see `survey`.
 
@@ -215,7 +239,7 @@ def _noise(even: Image, odd: Image, planes: int, difference: NDArray[np.int32], 
             by_plane[0, p, k // SPARSE] = _SIGMA * own
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _second_differences(row: Image, step: int, out: NDArray[np.int32]) -> None:
     """Absolute second differences of samples `step` apart."""
     n = max(len(row) - 2 * step, 0)
@@ -224,7 +248,7 @@ def _second_differences(row: Image, step: int, out: NDArray[np.int32]) -> None:
         d[x] = abs(np.int32(a[x]) - np.int32(2) * np.int32(b[x]) + np.int32(c[x]))
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _mean(values: NDArray[np.int32], first: int, last: int, step: int) -> float:
     """Mean of every so many of `values`, 0 where there are none."""
     part = values[first : max(last, first)]
@@ -238,26 +262,17 @@ def _mean(values: NDArray[np.int32], first: int, last: int, step: int) -> float:
     return total / max((len(part) + step - 1) // step, 1)
 
 
-@njit(cache=True)
-def settle(
-    raw_level: Image,
-    raw_sigma: Array,
-    by_plane: Array,
-    least: float,
-    most: float,
-    level: Array,
-    sigma: Array,
-    spread: Array,
-    shared: Array,
-) -> None:
+@njit(error_model="numpy")
+def settle(known: Map, least: float, most: float) -> None:
     """Write what a frame's blocks say together.
 
-    Smooth `level` and `sigma`, and of each plane the `spread`, its noise over sigma,
-    and how many times over, `shared` (4,), noise averages out less than that of independent samples, up to `most`.
+    Smooth `level` and `sigma`, at `least` so much, and of each plane the `spread`, its noise over sigma, and how many
+    times over, `shared`, noise averages out less than that of independent samples, up to `most`.
     """
+    level, sigma, spread, shared, by_plane = known.level, known.sigma, known.spread, known.shared, known.by_plane
     for p in range(len(level)):
-        _smoothed(raw_level[p], level[p])
-    _smoothed(raw_sigma, sigma)
+        _smoothed(known.raw_level[p], level[p])
+    _smoothed(known.raw_sigma, sigma)
     for i in range(sigma.shape[0]):
         for j in range(sigma.shape[1]):
             sigma[i, j] = max(sigma[i, j], least)
@@ -268,7 +283,7 @@ def settle(
         shared[p] = min(max((np.median(by_plane[1, p].copy()) / max(own, 0.7 * least)) ** 2, 1.0), most)
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _second_difference_of_sums(row: Image) -> float:
     """The same of sums of `TILE_PX` neighbours, over the root of their number."""
     count = len(row) // TILE_PX
@@ -285,7 +300,7 @@ def _second_difference_of_sums(row: Image) -> float:
     return total / ((count - 2) * np.sqrt(TILE_PX))
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _levels(peak: Image, b: int, level: Image) -> None:
     """Write the median of the tiles of each block of one row of blocks, row by row and then of those, to `level[b]`."""
     h, w = peak.shape
@@ -304,7 +319,7 @@ def _levels(peak: Image, b: int, level: Image) -> None:
     _middle_of_eight(rows, level[b])
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _middle_of_eight(r: Image, out: Image) -> None:
     """Write the fifth smallest of each column of `r` (8, n) to `out`: of two sorted halves."""
     for x in range(len(out)):
@@ -313,14 +328,14 @@ def _middle_of_eight(r: Image, out: Image) -> None:
         out[x] = min(min(max(a, h), max(b, g)), min(max(c, f), max(d, e)))
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _sorted_four(a: float, b: float, c: float, d: float) -> tuple[float, float, float, float]:
     a, b, c, d = min(a, b), max(a, b), min(c, d), max(c, d)
     a, c, b, d = min(a, c), max(a, c), min(b, d), max(b, d)
     return a, min(b, c), max(b, c), d
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _smoothed(values: Array, out: Array) -> None:
     """Write the median of five columns of the medians of five rows around each of `values` (h, w) to `out`."""
     h, w = values.shape
@@ -336,100 +351,7 @@ def _smoothed(values: Array, out: Array) -> None:
             row[j] = _median_of_five(middle[j], middle[j + 1], middle[j + 2], middle[j + 3], middle[j + 4])
 
 
-@njit(cache=True)
+@njit(error_model="numpy")
 def _median_of_five(a: float, b: float, c: float, d: float, e: float) -> float:
     f, g = max(min(a, b), min(c, d)), min(max(a, b), max(c, d))
     return max(min(f, g), min(max(f, g), e))
-
-
-@njit(cache=True)
-def candidates(
-    peak: Image,
-    level: Array,
-    sigma: Array,
-    spread: float,
-    contrast: float,
-    clipped: float,
-    rect: Indices,
-    seen: Image,
-    found: Array,
-) -> int:
-    """Write the tiles of `rect` that may hold a light's peak to `found`: row, column, sigmas over the background.
-
-    Of one plane: `peak` (h, w), `level` of its blocks, and `spread` times `sigma` for its noise. Such a tile clears its
-    background by `contrast` sigmas; no two neighbours on opposite sides are brighter together, as on a slope, and next
-    to it or a few tiles away they are darker by a margin, as on a halo they are not. Tiles that are `seen` (h, w) are
-    left out, and the others become it. Returns how many there are.
-    """
-    count, least, worth = 0, np.empty(peak.shape[1], peak.dtype), np.empty(peak.shape[1], np.uint8)
-    for i in range(rect[0], rect[1]):
-        b = i // BLOCK
-        if i == rect[0] or i % BLOCK == 0:
-            for k in range(rect[2] // BLOCK, (rect[3] + BLOCK - 1) // BLOCK):
-                value = min(np.ceil(level[b, k] + contrast * spread * sigma[b, k]), clipped)
-                for j in range(max(k * BLOCK, rect[2]), min((k + 1) * BLOCK, rect[3])):
-                    least[j] = value
-        if not _worth_a_look(peak[i], least, rect[2], rect[3], worth):
-            continue
-        for j in range(rect[2], rect[3]):
-            if not worth[j] or seen[i, j] or count == len(found):
-                continue
-            here = spread * sigma[b, j // BLOCK]
-            if not _stands_out(peak, i, j, max(int(1.5 * contrast * here), 2), int(clipped)):
-                continue
-            seen[i, j] = 1
-            found[count, 0], found[count, 1] = i, j
-            found[count, 2] = (peak[i, j] - level[b, j // BLOCK]) / here
-            count += 1
-    return count
-
-
-@njit(cache=True)
-def _worth_a_look(row: Image, least: Image, first: int, last: int, worth: Image) -> bool:
-    """Mark the tiles of a part of a row that reach the `least` value and stand on no slope along it; whether any."""
-    here, limit, mark = row[first:last], least[first:last], worth[first:last]
-    total = 0
-    for x in range(len(here)):
-        mark[x] = here[x] >= limit[x]
-        total += mark[x]
-    if total == 0:
-        return False
-    left, middle, right, inner = here[:-2], here[1:-1], here[2:], mark[1:-1]
-    for x in range(len(inner)):
-        inner[x] &= 2 * np.int32(middle[x]) >= np.int32(left[x]) + np.int32(right[x])
-    return True
-
-
-@njit(cache=True)
-def _stands_out(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
-    """Whether a tile is neither on a slope nor on a halo, see `candidates`: along the row first, which settles most."""
-    w = peak.shape[1]
-    twice = 2 * int(peak[i, j])
-    near = twice - int(peak[i, max(j - 1, 0)]) - int(peak[i, min(j + 1, w - 1)])
-    if near < 0:
-        return False
-    if twice < 2 * clipped and near < margin:
-        far = twice - int(peak[i, max(j - _FAR, 0)]) - int(peak[i, min(j + _FAR, w - 1)])
-        if far < margin:
-            return False
-    near = over_pairs(peak, i, j, 1)
-    if near < 0:
-        return False
-    if twice >= 2 * clipped or near >= margin:
-        return True
-    for d in range(2, _FAR):  # the top of a wide light, and not every bump on its flanks
-        if over_pairs(peak, i, j, d) < 0:
-            return False
-    return over_pairs(peak, i, j, _FAR) >= margin
-
-
-@njit(cache=True)
-def over_pairs(peak: Image, i: int, j: int, d: int) -> int:
-    """Twice the value of a tile less that of two on opposite sides, `d` tiles away, the least of four ways."""
-    h, w = peak.shape
-    top, bottom, left, right = max(i - d, 0), min(i + d, h - 1), max(j - d, 0), min(j + d, w - 1)
-    most = max(
-        max(int(peak[top, j]) + int(peak[bottom, j]), int(peak[i, left]) + int(peak[i, right])),
-        max(int(peak[top, left]) + int(peak[bottom, right]), int(peak[top, right]) + int(peak[bottom, left])),
-    )
-    return 2 * int(peak[i, j]) - most

@@ -1,0 +1,130 @@
+"""The tiles that may hold the peak of a light."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from lumidock._kernels.tiles import BLOCK
+from lumidock.datatypes import Array, Image, Indices
+
+_FAR = 4  # tiles at which the slopes of a wide light show
+_HALO = 40.0  # sigmas over the background that only the halo of something bright reaches beside its peak
+
+
+@njit(error_model="numpy")
+def candidates(
+    peak: Image,
+    level: Array,
+    sigma: Array,
+    spread: float,
+    shot: float,
+    contrast: float,
+    clipped: float,
+    together: Image,
+    rect: Indices,
+    seen: Image,
+    found: Array,
+) -> int:
+    """Write the tiles of `rect` that may hold a light's peak to `found`: row, column, sigmas over the background.
+
+    Of one plane: `peak` (h, w), `level` of its blocks, and `spread` times `sigma` for its noise. Such a tile clears its
+    background by `contrast` sigmas; no two neighbours on opposite sides are brighter together, as on a slope, and next
+    to it or a few tiles away they are darker by a margin, as on a halo they are not; on a bright one its noise has
+    `shot`, a variance per value, on top. A tile that with all around it is saturated in the maps that count `together`
+    (Q, h, w) is left to those at the region's rim; so are tiles that are `seen` (h, w), and the others become it.
+    Returns how many there are.
+    """
+    count, least, worth = 0, np.empty(peak.shape[1], peak.dtype), np.empty(peak.shape[1], np.uint8)
+    for i in range(rect[0], rect[1]):
+        b = i // BLOCK
+        if i == rect[0] or i % BLOCK == 0:
+            for k in range(rect[2] // BLOCK, (rect[3] + BLOCK - 1) // BLOCK):
+                value = min(np.ceil(level[b, k] + contrast * spread * sigma[b, k]), clipped)
+                for j in range(max(k * BLOCK, rect[2]), min((k + 1) * BLOCK, rect[3])):
+                    least[j] = value
+        if not _worth_a_look(peak, i, least, rect[2], rect[3], worth):
+            continue
+        for j in range(rect[2], rect[3]):
+            if not worth[j] or seen[i, j] or count == len(found):
+                continue
+            here, over = spread * sigma[b, j // BLOCK], peak[i, j] - level[b, j // BLOCK]
+            local = np.sqrt(here * here + shot * max(over - _HALO * here, 0.0))
+            if not _stands_out(peak, i, j, max(int(1.5 * contrast * local), 2), int(clipped)):
+                continue
+            if peak[i, j] >= clipped and _is_inner(together, i, j, int(clipped)):
+                continue
+            seen[i, j] = 1
+            found[count, 0], found[count, 1] = i, j
+            found[count, 2] = over / here
+            count += 1
+    return count
+
+
+@njit(error_model="numpy")
+def _worth_a_look(peak: Image, i: int, least: Image, first: int, last: int, worth: Image) -> bool:
+    """Mark the tiles of a part of a row that reach the `least` value and stand on no slope; whether any reach it."""
+    here, limit, mark = peak[i, first:last], least[first:last], worth[first:last]
+    total = 0
+    for x in range(len(here)):
+        mark[x] = here[x] >= limit[x]
+        total += mark[x]
+    if total == 0:
+        return False
+    above, below = peak[max(i - 1, 0), first:last], peak[min(i + 1, len(peak) - 1), first:last]
+    for x in range(1, len(here) - 1):
+        most = max(np.int32(here[x - 1]) + np.int32(here[x + 1]), np.int32(above[x]) + np.int32(below[x]))
+        most = max(most, np.int32(above[x - 1]) + np.int32(below[x + 1]))
+        most = max(most, np.int32(above[x + 1]) + np.int32(below[x - 1]))
+        mark[x] &= 2 * np.int32(here[x]) >= most
+    return True
+
+
+@njit(error_model="numpy")
+def _stands_out(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
+    """Whether a tile is neither on a slope nor on a halo, see `candidates`: along the row first, which settles most."""
+    w = peak.shape[1]
+    twice = 2 * int(peak[i, j])
+    near = twice - int(peak[i, max(j - 1, 0)]) - int(peak[i, min(j + 1, w - 1)])
+    if near < 0:
+        return False
+    if twice < 2 * clipped and near < margin:
+        far = twice - int(peak[i, max(j - _FAR, 0)]) - int(peak[i, min(j + _FAR, w - 1)])
+        if far < margin:
+            return False
+    near = over_pairs(peak, i, j, 1)
+    if near < 0:
+        return False
+    if twice >= 2 * clipped or near >= margin:
+        return True
+    for d in range(2, _FAR):  # the top of a wide light, and not every bump on its flanks
+        if over_pairs(peak, i, j, d) < 0:
+            return False
+    return over_pairs(peak, i, j, _FAR) >= margin
+
+
+@njit(error_model="numpy")
+def _is_inner(together: Image, i: int, j: int, clipped: int) -> bool:
+    """Whether a tile and all around it are saturated in every map."""
+    _, h, w = together.shape
+    if i == 0 or j == 0 or i == h - 1 or j == w - 1:
+        return False
+    for q in range(len(together)):
+        least = together[q, i, j]
+        for y in range(i - 1, i + 2):
+            least = min(least, min(together[q, y, j - 1], min(together[q, y, j], together[q, y, j + 1])))
+        if least < clipped:
+            return False
+    return True
+
+
+@njit(error_model="numpy")
+def over_pairs(peak: Image, i: int, j: int, d: int) -> int:
+    """Twice the value of a tile less that of two on opposite sides, `d` tiles away, the least of four ways."""
+    h, w = peak.shape
+    top, bottom, left, right = max(i - d, 0), min(i + d, h - 1), max(j - d, 0), min(j + d, w - 1)
+    most = max(
+        max(int(peak[top, j]) + int(peak[bottom, j]), int(peak[i, left]) + int(peak[i, right])),
+        max(int(peak[top, left]) + int(peak[bottom, right]), int(peak[top, right]) + int(peak[bottom, left])),
+    )
+    return 2 * int(peak[i, j]) - most
