@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import shutil
+import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -163,7 +164,19 @@ def _mapping(workers: int) -> Iterator[Callable[..., Iterable[Any]]]:
         return
     spawn = get_context("spawn")  # a fork would inherit the locks of OpenCV's threads
     with ProcessPoolExecutor(workers, mp_context=spawn, initializer=cv2.setNumThreads, initargs=(1,)) as pool:
-        yield partial(pool.map, chunksize=4)
+        try:
+            yield partial(_mapped, pool)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _mapped(pool: ProcessPoolExecutor, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
+    """`map` over workers that never hear of Ctrl-C, not even while they start: it is their parent that ends them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        return pool.map(function, items, chunksize=4)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _write_frame(plan: Plan, out: Path, row: Row) -> _Written:
