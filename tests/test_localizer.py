@@ -154,6 +154,18 @@ def test_four_lights_that_leave_two_poses_promise_neither():
         require_true(localizer.process_detections(frame.detections), frame.T_dock_cam)
 
 
+@pytest.mark.parametrize("seed", [101, 300, 301])
+def test_three_lights_and_a_stray_beside_a_fourth_prove_no_pose(seed):
+    """A stray spot in the gate of a missing light makes a fourth: one frame must not make a valid pose of them."""
+    prior = {"roll_deg": 3.0, "pitch_deg": 3.0, "yaw_deg": 3.0}
+    config = Config.model_validate({"prior": prior, "match": {"steady": 0.0}})
+    localizer = Localizer(STATION, CAMERA, config)
+    for frame in frames_of("three-lights", seed=seed)[:600]:
+        if frame.step == 0:
+            localizer.forget()
+        assert not localizer.process_detections(frame.detections).valid, f"seed {seed}, frame {frame.detections.frame}"
+
+
 @pytest.mark.parametrize("seed", [50986, 51642, 53451, 54175, 54323, 55695, 56155, 51368, 60070])
 def test_a_slow_camera_follows_no_wrong_names(seed):
     """Six frames a second: wide gates, layers that enter while the speed is unknown, clutter where lights were.
