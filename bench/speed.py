@@ -30,6 +30,7 @@ from lumidock.station import Station
 from lumidock.streams.sources import open_source
 
 _Z_M, _ROUNDS, _SEED, _STARTS = (18.0, 9.0, 2.3), 7, 7100, 3
+_LIGHTS, _STRAYS = (7, 13, 25, 50), (0, 2, 10, 50)
 _OUTPUT = {
     "mono8": ("output.pixels=mono8", "output.color=false", "output.file=png"),
     "bayer_rggb8": ("output.pixels=bayer8", "output.file=png"),
@@ -116,12 +117,13 @@ def growth(spurious: tuple[int, ...]) -> dict[str, float]:
     return found
 
 
-def matching_growth(lights: tuple[int, ...], spurious: tuple[int, ...]) -> dict[str, tuple[float, float]]:
-    """Median and largest ms of naming one frame without history, by lights and spurious spots; some are dark.
+def matching_growth(lights: tuple[int, ...], spurious: tuple[int, ...]) -> dict[int, dict[int, tuple[float, float]]]:
+    """Median and largest ms of naming one frame without history, by lights, then spurious spots; some are dark.
 
     The lights stand anywhere on two planes 5 m apart, as many on either, and are seen from 9 m without colour.
     """
-    rng, camera, config, grown = np.random.default_rng(_SEED), shipped_camera(), Config(), {}
+    rng, camera, config = np.random.default_rng(_SEED), shipped_camera(), Config()
+    grown: dict[int, dict[int, tuple[float, float]]] = {m: {} for m in lights}
     for m in lights:
         station = dense_station(m, rng)
         plan, expected = match.plan(station, camera, config.match), match.prior(None, config.prior)
@@ -137,7 +139,7 @@ def matching_growth(lights: tuple[int, ...], spurious: tuple[int, ...]) -> dict[
                     "match",
                     lambda f=found, p=plan, e=expected: match.acquire(f, p, camera, e, config.match),
                 )
-            grown[f"{m} lights, {count} spurious"] = float(np.median(times["match"])), max(times["match"])
+            grown[m][count] = float(np.median(times["match"])), max(times["match"])
     return grown
 
 
@@ -239,12 +241,18 @@ def main() -> tuple[dict[str, object], list[str]]:
             content[f"{kind}: {job}"] = medians
             lines.append(f"| {kind}: {job} | " + " | ".join(f"{m:.2f} ({m / one_pass:.1f})" for m in medians) + " |")
     content["growth_ms"] = grown = growth((2, 20, 200))
-    content["matching_ms"] = named = matching_growth((7, 13, 25, 50), (0, 2, 10, 50))
+    content["matching_ms"] = named = matching_growth(_LIGHTS, _STRAYS)
     (cold_s, warm_s), peak = start_up(frames[9.0, "bgr8"][0]), peak_memory()
     content |= {"start_cold_s": cold_s, "start_warm_s": warm_s, "peak_mib": peak, "machine": machine()}
     lines += ["", "Full search of a mono frame, ms: " + ", ".join(f"{k} {v:.2f}" for k, v in grown.items()) + "."]
-    lines.append("Naming a frame without history, ms, median and largest:")
-    lines[-1] += " " + ", ".join(f"{k} {a:.2f} / {b:.2f}" for k, (a, b) in named.items()) + "."
+    lines += [
+        "",
+        "| naming a frame without history, ms: median / largest | " + " | ".join(map(str, _STRAYS)) + " spurious |",
+    ]
+    lines += ["|---" * (len(_STRAYS) + 1) + "|"]
+    for m, row in named.items():
+        lines.append(f"| {m} lights | " + " | ".join(f"{a:.2f} / {b:.2f}" for a, b in row.values()) + " |")
+    lines.append("")
     lines.append(
         f"Start to the third frame: {cold_s:.1f} s while compiling, {warm_s:.2f} s after; peak memory of a run over a "
         f"folder {peak:.0f} MiB."
