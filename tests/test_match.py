@@ -1,28 +1,19 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import assert_close
 from numpy.testing import assert_array_equal
 from scipy.spatial.transform import Rotation
+from tracks import CAMERA, CONFIG, PLAN, STATION, M
 
 from lumidock import match, verify
-from lumidock.camera import load_camera
-from lumidock.config import Config
 from lumidock.datatypes import Attitude, Detections
 from lumidock.geometry import se3_inverse
 from lumidock.pose import project_lights
 from lumidock.sim.scenario import load_scenario
 from lumidock.sim.spots import spot_frames
-from lumidock.station import load_station
 
-ROOT = Path(__file__).parents[1]
-STATION = load_station(ROOT / "stations" / "cage-2x2x5.yaml")
-CAMERA = load_camera(ROOT / "cameras" / "imx264-60deg.yaml")
-CONFIG = Config()
-PLAN = match.plan(STATION, CAMERA, CONFIG.match)
-M = len(STATION)
 HEAD_ON = np.diag([1.0, -1.0, -1.0])
 
 
