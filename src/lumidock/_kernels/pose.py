@@ -15,7 +15,7 @@ from lumidock._kernels.lens import factor, project, rotate_exp, solve_factored
 from lumidock.datatypes import Array
 
 SAME_TURN = 2e-3  # rad; closer solutions are one
-_MAX_TURN, _FAR_LOG = 0.5, 1e9  # rad of one step; cost of what cannot be
+_MAX_TURN = 0.5  # rad of one step
 
 
 @njit(cache=True, error_model="numpy")
