@@ -15,6 +15,7 @@ from bench import (
     contact_sheet,
     detection,
     detector_errors,
+    dockings,
     doors,
     images,
     rendering,
@@ -22,7 +23,6 @@ from bench import (
     speed,
     table1,
     visibility,
-    waters,
 )
 
 BENCHES = {
@@ -32,7 +32,7 @@ BENCHES = {
     "speed": speed,
     "detection": detection,
     "detector-errors": detector_errors,
-    "waters": waters,
+    "dockings": dockings,
     "visibility": visibility,
     "rendering": rendering,
     "reproduced": reproduced,

@@ -344,9 +344,9 @@ def test_a_frame_takes_microseconds():
     frames_of("missing-spurious")
     best = np.inf
     for seed in range(3):
-        start = time.perf_counter()
+        start = time.process_time()
         count = len(frames_of("missing-spurious", seed=seed))
-        best = min(best, (time.perf_counter() - start) / count)
+        best = min(best, (time.process_time() - start) / count)
     assert best < 100e-6
 
 

@@ -286,7 +286,7 @@ def test_evaluation_takes_microseconds():
     """Thirty are the bound for a frame; alone it takes about five."""
     run, best = a_run("nominal", lambda _, frame: right(frame)), np.inf
     for _ in range(3):
-        start = time.perf_counter()
+        start = time.process_time()
         tally_run(run)
-        best = min(best, time.perf_counter() - start)
+        best = min(best, time.process_time() - start)
     assert best / len(run.frames) < 30e-6

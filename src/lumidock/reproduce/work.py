@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -82,8 +82,16 @@ def campaign(dock: Dock, scenario: str, settings: list[str], first: int, stop: i
 # Rendered
 
 
-def docking(dock: Dock, scenario: str, settings: list[str], seed: int, folder: str, keep: bool) -> dict[str, Any]:
-    """Render a scenario in memory and run both methods on it, into `folder`; pictures only to `keep` land there."""
+def docking(
+    dock: Dock,
+    scenario: str,
+    settings: list[str],
+    seed: int,
+    folder: str,
+    keep: bool,
+    methods: Sequence[str] = tuple(METHODS),
+) -> dict[str, Any]:
+    """Render a scenario in memory and run the methods on it, into `folder`; pictures only to `keep` land there."""
     station, camera = _load(dock)
     loaded, place = load_scenario(scenario, tuple(settings)), Path(folder)
     shutil.rmtree(place, ignore_errors=True)
@@ -95,7 +103,7 @@ def docking(dock: Dock, scenario: str, settings: list[str], seed: int, folder: s
         (sequence / "frames").mkdir()
         for row, content in pictures:
             (sequence / "frames" / file_of(row, loaded)).write_bytes(content)
-    return {method: _run_method(dock, method, sequence, pictures, place / method) for method in METHODS}
+    return {method: _run_method(dock, method, sequence, pictures, place / method) for method in methods}
 
 
 def _run_method(dock: Dock, method: str, sequence: Path, pictures: Pictures, out: Path) -> dict[str, Any]:
