@@ -150,9 +150,9 @@ class DetectConfig(Section):
     signal_noise: PositiveFloat = 0.01  # variance of a pixel per grey level of signal: shot noise, mosaic, JPEG
     linear_noise: PositiveFloat = 0.024  # the same of mosaics and of 16 bits, which no gamma bends: 255 over 10.7 ke-
     texture: PositiveFloat = 0.5  # share of its radius by which texture as strong as a spot moves the centre, 1 sigma
-    floor_px: PositiveFloat = 0.01  # 1 sigma of a centre that has no noise
-    coarse_px: PositiveFloat = 0.03  # the same where blue or red is brightest: JPEG has fewer samples of them
-    saturated_px: PositiveFloat = 0.045  # the same of a wide or saturated spot, over the root of its radius, in samples
+    floor_px: PositiveFloat = 0.008  # 1 sigma of a centre that has no noise
+    coarse_px: PositiveFloat = 0.026  # the same where blue or red is brightest: JPEG has fewer samples of them
+    saturated_px: PositiveFloat = 0.025  # the same of a wide or saturated spot, over the root of its radius, in samples
     cut: Fraction = 0.3  # 1 sigma, of the radius, of a centre whose spot the picture's edge cuts
     glint_radii: PositiveFloat = 3.6  # a spot this near, in radii of the stronger one, ...
     glint_ratio: PositiveFloat = 2.2  # ... with this many times less flux is a glint, ...

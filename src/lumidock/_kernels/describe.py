@@ -16,6 +16,15 @@ _GRID_OF_FIELD = 0.1  # px, the same of the way between fields, of which each ha
 _WIDTHS = 3  # times the width of what stands over the noise, from which a fit is tried: faint flanks are not seen
 _LEAST_NOISE = 0.7  # of what a search allows for: a sample's rounding, and noise too small to show beside it
 _BETWEEN = np.sqrt(1.0 / 12.0)  # 1 sigma of an instant between two fields, of the way between them
+_SOFT = 0.2  # of a spot's height, by which the weights of its balance reach below the level of its region ...
+_BROAD_PX = 2.4  # ... if its edge is no wider, which is none or a halo's; from a pixel less on, all of that
+_STEEP, _STEEP_PX, _NARROW_PX, _STEEPEST = 3.6, 1.18, 0.2, 6.0  # times a smooth spot's error by the grid that a steep
+# edge adds; as wide, and per so much less as many times more; and the most
+_BURNT = 0.95  # of saturation, on the average of all planes, from which an edge may be steep
+_FINER = 1.6  # times the samples that a picture of one plane has of an edge: colours were interpolated
+_PLATEAU = 0.9  # of the height; less is edge
+_WIDEST_PX2 = 500.0  # area of a spot whose edge is told from its inside; of a wider one it matters little
+_HAZE, _HAZE_PX = 0.28, 8.0  # px, 1 sigma, by a halo as bright as the spot; in proportion to the radius up to this one
 _FINE_MARK, _SKEW_MARK = 100, 101  # of regions grown again, beside those of the levels tried
 
 
@@ -56,21 +65,28 @@ def describe(
     center, cov = np.empty(2), np.empty(3)
     variance = noise**2 + q[fields.SIGNAL_NOISE] * max(sums[patch.W] / sums[patch.N], 0.0)
     unit = where[patch.UNIT]
+    edge = _edge(image, planes, scale, weight, window, where, start, ground[0], top)
+    soft = _SOFT * (top - ground[0]) * min(max(_BROAD_PX - edge, 0.0), 1.0)
+    on_grid = q[fields.SATURATED_PX] * (
+        _steepness(planes, edge) if spot[fields.CORE] > _BURNT * q[fields.CLIPPED] else 1.0
+    )
+    patch.soften(window, where, start, level, level - soft)
     patch.balance(sums, variance * gauss.averaging(ground[4], radius), center, cov)
-    between_u, between_v = patch.fields_apart(window, where, start, level)
-    shift_u, shift_v = _plane_shift(image, planes, scale, weight, window, where, start, level)
+    between_u, between_v = patch.fields_apart(window, where, start, level - soft)
+    shift_u, shift_v = _plane_shift(image, planes, scale, weight, window, where, start, level - soft)
     center[0] = where[patch.LEFT] + unit * (start[0] + center[0]) + shift_u
     center[1] = where[patch.TOP] + unit * (start[1] + center[1]) + shift_v
     higher = level + 0.5 * (top - level)
-    skew_u, skew_v = _skew(image, window, where, start, higher, q, unit)
+    skew_u, skew_v = _skew(image, window, where, start, higher, soft, q, unit)
     if skew_u != 0.0 or skew_v != 0.0:
-        other_u, other_v = _plane_shift(image, planes, scale, weight, window, where, start, higher)
+        other_u, other_v = _plane_shift(image, planes, scale, weight, window, where, start, higher - soft)
         skew_u, skew_v = skew_u + other_u - shift_u, skew_v + other_v - shift_v
     noise_of_balance = unit * unit * (cov[0] + cov[2] + 2.0 * (_GRID_OF_MOSAIC if planes == 4 else _GRID) ** 2)
     # the higher region is a part of the lower one, so that half of their noise is common
     skewed = _disagreement(skew_u, skew_v, 0.5 * unit * unit * (cov[0] + cov[2] + 2.0 * _GRID**2))
     # half of it along the skew, half of it any way: a grid skews a spot one way and displaces it another
-    astray = 0.25 * (skewed[0] + skewed[2]) + (q[fields.SATURATED_PX] * unit) ** 2 * unit / radius
+    haze = _HAZE * min(max(spot[fields.HALO], 0.0), 1.0) * min(radius / _HAZE_PX, 1.0)
+    astray = 0.25 * (skewed[0] + skewed[2]) + (on_grid * unit) ** 2 * unit / radius + haze**2
     cov[0], cov[1], cov[2] = (
         unit * unit * cov[0] + 0.5 * skewed[0] + astray,
         unit * unit * cov[1] + 0.5 * skewed[1],
@@ -95,6 +111,7 @@ def describe(
                     sample_noise,
                     q[fields.SIGNAL_NOISE],
                     ground[4],
+                    _is_coarse(planes, weight),
                     q[fields.CLIPPED],
                     cov,
                 )
@@ -133,13 +150,18 @@ def _size(
 @njit(error_model="numpy")
 def _floor(planes: int, weight: Array, spot: Array, sums: Array, q: Array) -> float:
     """Variance of a centre that has no noise."""
-    coarse = planes == 3 and weight[1] < max(weight[0], weight[2])
     variance = q[fields.FLOOR_PX] ** 2
-    if coarse:  # along a longer outline the error of a sample averages out
-        variance = (q[fields.COARSE_PX] * min(q[fields.SMALL_PX] / spot[fields.RADIUS], 1.0)) ** 2
+    if _is_coarse(planes, weight):  # along a longer outline the error of a sample averages out
+        variance = q[fields.COARSE_PX] ** 2 * min(q[fields.SMALL_PX] / spot[fields.RADIUS], 1.0)
     if sums[patch.EDGE] > 0.0:
         variance += (q[fields.CUT_SHARE] * spot[fields.RADIUS]) ** 2
     return float(variance)
+
+
+@njit(error_model="numpy")
+def _is_coarse(planes: int, weight: Array) -> bool:
+    """Whether a spot shows most in a colour that has half of the samples: blue or red."""
+    return bool(planes == 3 and weight[1] < max(weight[0], weight[2]))
 
 
 @njit(error_model="numpy")
@@ -227,8 +249,48 @@ def _plane_shift(
 
 
 @njit(error_model="numpy")
+def _edge(
+    image: Image,
+    planes: int,
+    scale: float,
+    weight: Array,
+    window: Window,
+    where: Array,
+    start: Indices,
+    floor: float,
+    top: float,
+) -> float:
+    """Width px of a spot's edge, from its region, grown last, to its inside of nine tenths of the height.
+
+    In the picture as it is, for the window may be smoothed. Infinite for a wide spot.
+    """
+    stamp, mark, unit, area = window[1], window[1][start[1], start[0]], int(where[patch.UNIT]), window[3][patch.N]
+    if area * unit * unit > _WIDEST_PX2:
+        return np.inf
+    high, inner = floor + _PLATEAU * (top - floor), 0.0
+    for i in range(int(where[patch.ROWS])):
+        for j in range(int(where[patch.COLUMNS])):
+            if stamp[i, j] == mark:
+                y, x, value = int(where[patch.TOP]) + i * unit, int(where[patch.LEFT]) + j * unit, 0.0
+                for p in range(planes):
+                    value += weight[p] * scale * samples.sample(image, planes, p, y, x)
+                inner += value > high
+    return float((np.sqrt(area / np.pi) - np.sqrt(inner / np.pi)) * unit)
+
+
+@njit(error_model="numpy")
+def _steepness(planes: int, edge: float) -> float:
+    """How many times the error that the grid leaves to a smooth spot is that of one with an edge so wide.
+
+    That of an overexposed light is narrower than a sample, whose values then hardly tell where it is.
+    """
+    wide = edge * (1.0 if planes == 3 else _FINER)
+    return float(min(1.0 + _STEEP * np.exp((_STEEP_PX - wide) / _NARROW_PX), _STEEPEST))
+
+
+@njit(error_model="numpy")
 def _skew(
-    image: Image, window: Window, where: Array, start: Indices, level: float, q: Array, unit: float
+    image: Image, window: Window, where: Array, start: Indices, level: float, soft: float, q: Array, unit: float
 ) -> tuple[float, float]:
     """How far the centre moves, px, when the spot is cut out higher: what an uneven halo or a glint does to it."""
     sums = window[3]
@@ -237,6 +299,7 @@ def _skew(
     patch.grow(window, where, image, start[0], start[1], level, q[fields.CLIPPED], _SKEW_MARK)
     skew = (0.0, 0.0)
     if sums[patch.N] >= 4.0:
+        patch.soften(window, where, start, level, level - soft)
         skew = unit * (sums[patch.WX] / sums[patch.W] - x), unit * (sums[patch.WY] / sums[patch.W] - y)
     sums[:] = kept
     return skew

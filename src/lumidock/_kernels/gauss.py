@@ -9,7 +9,8 @@ from lumidock.datatypes import Array, Image
 
 _ROUNDS, _REACH = 6, 9
 _PRIOR_DOF = 6.0  # how much the expected noise counts beside the residuals of a fit
-_PROFILE = 0.05  # share of the signal by which a spot's profile is no Gaussian
+_PROFILE = 0.07  # share of the signal by which a spot's profile is no Gaussian
+_TELLING = 0.35  # of its height, at the samples that tell most of a spot's place
 _LEFT = 0.3  # share of the degrees of freedom that a fit leaves at least
 _FITTED = 2.0  # of the residuals' degrees of freedom, that the position takes up where noise is not shared
 
@@ -26,6 +27,7 @@ def fit(
     noise: float,
     signal_noise: float,
     shared: float,
+    coarse: bool,
     clipped: float,
     cov: Array,
 ) -> float:
@@ -34,8 +36,8 @@ def fit(
     Position and width are common, amplitude and background are of each plane and eliminated (variable projection), so
     that a mosaic's coarse planes bias nothing; saturated samples are left out, which is how the wings of a small
     clipped light give its centre. The residuals scale the covariance, and so does how many samples, `shared`, have the
-    same noise. Returns the width, 0 where the fit does not
-    settle, which leaves everything as it was.
+    same noise, where the signal is `coarse` that of the signal too. Returns the width, 0 where the fit does not settle,
+    which leaves everything as it was.
     """
     reach = min(max(int(np.ceil(2.2 * width)) + 1, 3 if planes < 4 else 4), _REACH)
     u0, v0 = int(np.floor(center[0] + 0.5)), int(np.floor(center[1] + 0.5))
@@ -92,6 +94,8 @@ def fit(
         return 0.0
     center[0], center[1] = u, v
     scale_up = averaging(shared, s)
+    if not coarse:  # what the signal adds is of each sample; of a coarse colour they share that as well
+        scale_up = 1.0 + (scale_up - 1.0) / (1.0 + _TELLING * signal_noise * max(amplitude.max(), 0.0) / noise**2)
     fitted = _FITTED * scale_up
     place = (u - left, v - top)
     scale_up *= _misfit(z, (ex, ey), place, (left, top), s, parts, noise, signal_noise, fitted, amplitude, ground)
@@ -188,8 +192,9 @@ def _misfit(
                 square += share * share
     if weight <= 0.0:
         return 1.0
-    dof = weight * weight / square
-    return max((_PRIOR_DOF + dof * total / weight) / (_PRIOR_DOF + max(dof - fitted, _LEFT * dof)), least / weight)
+    dof, found, profile = weight * weight / square, total / weight, least / weight
+    least = min(found + profile, 1.0)  # a spot that is a Gaussian after all has noise as well
+    return max((_PRIOR_DOF + dof * found) / (_PRIOR_DOF + max(dof - fitted, _LEFT * dof)), least)
 
 
 @njit(error_model="numpy")

@@ -257,6 +257,41 @@ def _add_run(values: Array, a: float, b: float, level: float, clipped: float, su
 
 
 @njit(error_model="numpy")
+def soften(window: Window, where: Array, start: Indices, level: float, lower: float) -> None:
+    """Give the region grown last, at `level` around `start`, a soft edge: weights over `lower`, and a rim of a sample.
+
+    The edge of an overexposed light is narrower than a sample: cut at one level, its centre would follow the grid.
+    """
+    patch, stamp, rim, sums = window
+    columns, rows, mark = int(where[COLUMNS]), int(where[ROWS]), stamp[start[1], start[0]]
+    for k, of in ((W, N), (WX, X), (WY, Y)):
+        sums[k] += (level - lower) * sums[of]
+    count = 0
+    for i in range(rows):
+        line, mine = patch[i], stamp[i]
+        for j in range(columns):
+            if line[j] <= lower or mine[j] == mark:
+                continue
+            if _is_beside(stamp, i, j, rows, columns, mark):
+                rim[count, 0], rim[count, 1] = j, i
+                count += 1
+    for k in range(count):
+        j, i = rim[k]
+        _add_run(patch[i, j : j + 1], float(j - start[0]), float(i - start[1]), lower, np.inf, sums)
+        stamp[i, j] = mark
+
+
+@njit(error_model="numpy")
+def _is_beside(stamp: Image, i: int, j: int, rows: int, columns: int, mark: int) -> bool:
+    """Whether one of the eight samples around one has the mark."""
+    for d in range(max(i - 1, 0), min(i + 2, rows)):
+        for c in range(max(j - 1, 0), min(j + 2, columns)):
+            if stamp[d, c] == mark:
+                return True
+    return False
+
+
+@njit(error_model="numpy")
 def fields_apart(window: Window, where: Array, start: Indices, level: float) -> tuple[float, float]:
     """How far the centre by even rows lies from that by odd rows, px: the way between the fields of interlaced video.
 
