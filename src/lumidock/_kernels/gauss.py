@@ -192,9 +192,9 @@ def _misfit(
                 square += share * share
     if weight <= 0.0:
         return 1.0
-    dof, found, profile = weight * weight / square, total / weight, least / weight
-    least = min(found + profile, 1.0)  # a spot that is a Gaussian after all has noise as well
-    return max((_PRIOR_DOF + dof * found) / (_PRIOR_DOF + max(dof - fitted, _LEFT * dof)), least)
+    dof, found, granted = weight * weight / square, total / weight, least / weight
+    at_least = min(found + granted, 1.0)  # a spot that is a Gaussian after all has noise as well
+    return max((_PRIOR_DOF + dof * found) / (_PRIOR_DOF + max(dof - fitted, _LEFT * dof)), at_least)
 
 
 @njit(error_model="numpy")
