@@ -19,7 +19,7 @@ demo: setup
 	@$(BIN)/lumidock demo --force
 
 test: lint
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest -n auto --dist loadfile
 
 slow: setup
 	@$(BIN)/python -m pytest -m slow

@@ -154,10 +154,11 @@ def start_states(station: Station, attitude: Attitude | None, config: TrackConfi
 
 
 def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
-    """The track at a later time, its twist held but for white noise on it."""
+    """The track at a later time, its twist held but for white noise on it; what agreed too long ago proves nothing."""
     R, t, P = track.R.copy(), track.t.copy(), track.P.copy()
     kernel.predict(R, t, track.x[6:12], P, (t_ns - track.t_ns) * 1e-9, config.accel_m_s2**2, config.accel_rad_s2**2)
-    return replace(track, t_ns=t_ns, R=R, t=t, P=P)
+    lately = t_ns - track.agreed_ns <= config.max_gap_s * 1e9
+    return replace(track, t_ns=t_ns, R=R, t=t, P=P, proof=track.proof if lately else 0)
 
 
 def attend(track: Track, attitude: Attitude) -> Track:
@@ -279,8 +280,7 @@ def update(
     dof = 2 * used - (0 if at is None else 6)
     surprise = _deviate(nis, dof) if dof > 0 else 0.0
     agreed_ns = track.t_ns if used >= _PROOF_LIGHTS else track.agreed_ns
-    lately = track.t_ns - track.agreed_ns <= config.max_gap_s * 1e9
-    proof = (track.proof if lately else 0) + int(agreed_ns == track.t_ns)
+    proof = track.proof + int(agreed_ns == track.t_ns)
     return Track(
         track.t_ns,
         track.began_ns,
