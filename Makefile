@@ -19,6 +19,7 @@ demo: setup
 	@$(BIN)/lumidock demo --force
 
 test: lint
+	@$(BIN)/lumidock warm  # or every worker would compile the same
 	@$(BIN)/python -m pytest -n auto --dist loadfile
 
 slow: setup
