@@ -157,9 +157,9 @@ def guide_holds(bound: Bounds) -> bool:
 
 def stage(track: Track, plan: Plan) -> Stage | None:
     """Docking stage by the layers that the pose rests on (paper section 2.2); None without a light."""
-    count = np.bincount(plan.layer[track.name >= 0], minlength=plan.n_layers)
-    rear = int(count[plan.is_rear == 1].sum())
-    front = int(count.sum()) - rear
+    count = plan.count(track.name)
+    rear = sum(c for c, is_rear in zip(count, plan.is_rear, strict=True) if is_rear)
+    front = sum(count) - rear
     if front and rear:
         return "transition"
     return "rear" if rear else "front" if front else None

@@ -120,7 +120,6 @@ def _size(
     x, y = start[0] + sums[patch.X] / area, start[1] + sums[patch.Y] / area
     spot[fields.U], spot[fields.V] = where[patch.LEFT] + unit * x, where[patch.TOP] + unit * y
     spot[fields.RADIUS] = np.sqrt(area / np.pi) * unit
-    spot[fields.HALO] = _around(window[0], where, start, sums, 2.0, floor) / max(top - floor, 1e-6)
     flux = sums[patch.W] + area * (level - floor)
     spot[fields.FLUX] = flux * unit * unit
     spot[fields.SNR] = flux / (area * np.sqrt(shared * noise**2 / area + ground[2] ** 2))
@@ -169,20 +168,6 @@ def peak_value(part: Array, where: Array, start: Indices) -> float:
 
 
 @njit(error_model="numpy")
-def _around(part: Array, where: Array, start: Indices, sums: Array, radii: float, floor: float) -> float:
-    """Mean level over the floor on a circle around a region's centre, of so many of its radii."""
-    radius = radii * np.sqrt(sums[patch.N] / np.pi) + 1.0
-    x, y = start[0] + sums[patch.X] / sums[patch.N], start[1] + sums[patch.Y] / sums[patch.N]
-    total, count = 0.0, 0
-    for k in range(12):
-        a, b = int(x + radius * samples.COS[2 * k] + 0.5), int(y + radius * samples.SIN[2 * k] + 0.5)
-        if 0 <= a < where[patch.COLUMNS] and 0 <= b < where[patch.ROWS]:
-            total += part[b, a] - floor
-            count += 1
-    return total / max(count, 1)
-
-
-@njit(error_model="numpy")
 def _plane_shift(
     image: Image, planes: int, scale: float, weight: Array, window: Window, where: Array, start: Indices, level: float
 ) -> tuple[float, float]:
@@ -196,9 +181,11 @@ def _plane_shift(
         return 0.0, 0.0
     stamp, mark, unit = window[1], window[1][start[1], start[0]], int(where[patch.UNIT])
     total, rim, count = np.zeros((2, 5)), np.zeros((2, 5)), np.zeros((2, 2))  # outside, inside; planes and their mean
-    for i in range(1, int(where[patch.ROWS]) - 1):
+    sums, rows, columns = window[3], int(where[patch.ROWS]), int(where[patch.COLUMNS])
+    left, right = max(int(sums[patch.FIRST_COLUMN]) - 1, 1), min(int(sums[patch.LAST_COLUMN]) + 2, columns - 1)
+    for i in range(max(int(sums[patch.FIRST_ROW]) - 1, 1), min(int(sums[patch.LAST_ROW]) + 2, rows - 1)):
         y = int(where[patch.TOP]) + i * unit
-        for j in range(1, int(where[patch.COLUMNS]) - 1):
+        for j in range(left, right):
             inside = int(stamp[i, j] == mark)
             alike = (stamp[i - 1, j] == mark) + (stamp[i + 1, j] == mark)
             alike += (stamp[i, j - 1] == mark) + (stamp[i, j + 1] == mark)
@@ -264,8 +251,8 @@ def _unresolved(sums: Array, q: Array, unit: float) -> tuple[float, float, float
 @njit(error_model="numpy")
 def _is_known(spots: Array, n: int) -> bool:
     for k in range(n):
-        if np.hypot(spots[k, fields.U] - spots[n, fields.U], spots[k, fields.V] - spots[n, fields.V]) < max(
-            0.7 * spots[k, fields.RADIUS], 1.5
-        ):
+        du, dv = spots[k, fields.U] - spots[n, fields.U], spots[k, fields.V] - spots[n, fields.V]
+        near = max(0.7 * spots[k, fields.RADIUS], 1.5)
+        if abs(du) < near and abs(dv) < near and np.hypot(du, dv) < near:
             return True
     return False

@@ -158,7 +158,9 @@ def _misfit(
     no such balance, and every residual counts.
     """
     (ex, ey), whole = profile, True
-    var, info, signal = np.empty(z.shape), np.empty(z.shape), np.empty(z.shape)
+    var, info, signal, a = np.empty(z.shape), np.empty(z.shape), np.empty(z.shape), np.empty(z.shape[1])
+    for j in range(len(a)):
+        a[j] = ((j - center[0]) / s) ** 2
     for i in range(len(z)):
         b = ((i - center[1]) / s) ** 2
         for j in range(z.shape[1]):
@@ -166,7 +168,7 @@ def _misfit(
             g = amplitude[p] * ex[j] * ey[i]
             z[i, j] -= ground[p] + g
             var[i, j] = noise * noise + signal_noise * max(g, 0.0)
-            info[i, j] = g * g * (((j - center[0]) / s) ** 2 + b) / var[i, j]
+            info[i, j] = g * g * (a[j] + b) / var[i, j]
             whole &= not np.isnan(z[i, j])
             signal[i, j] = g
     allowed = (_PROFILE * signal) ** 2 if whole else np.zeros(z.shape)

@@ -83,7 +83,7 @@ def measure(
         sums = window[3]
         if part == 0.0:
             if not clipped:
-                _own(seen, window[1], where, start)
+                _own(seen, window, where, start)
                 return 0
             if sums[patch.OPEN] == 0.0 or reach >= 3.5 * q[fields.MAX_RADIUS_PX]:
                 _own_plateau(image, planes, scale, weight, v, u, reach, q, window, where, start, seen)
@@ -97,7 +97,7 @@ def measure(
         reach = wanted
     if part == 0.0:
         return 0
-    _own(seen, window[1], where, start)
+    _own(seen, window, where, start)
     ground[4] = (weight**2 * shared_by_plane**2).sum() / (weight**2).sum()
     if planes == 3:  # in the sum of channels fine noise is what JPEG leaves, and coarse noise that of the sensor
         ground[4] = min(max(ground[4] * (expected / ground[1]) ** 2, 1.0), _MOST_SHARED)
@@ -164,6 +164,7 @@ def _level(
     first = 1 if planes == 1 and top >= q[fields.CLIPPED] else 0
     fallback = 0.0
     if top <= floor:
+        patch.take_all(window[3], where)
         return 0.0
     for k in range(first, len(LEVELS) + 1):
         again = k == len(LEVELS)
@@ -197,12 +198,12 @@ def _holds_another(stamp: Image, where: Array, mark: int, spots: Array, n: int) 
 
 
 @njit(error_model="numpy")
-def _own(seen: Image, stamp: Image, where: Array, start: Indices) -> None:
+def _own(seen: Image, window: Window, where: Array, start: Indices) -> None:
     """Mark the tiles that the grown region touches: nobody looks there again."""
-    mark, t = stamp[start[1], start[0]], tiles.TILE_PX
-    unit, columns = int(where[patch.UNIT]), int(where[patch.COLUMNS])
-    for y in range(int(where[patch.ROWS])):
-        line, x = stamp[y], 0
+    stamp, sums, t = window[1], window[3], tiles.TILE_PX
+    mark, unit, columns = stamp[start[1], start[0]], int(where[patch.UNIT]), int(sums[patch.LAST_COLUMN]) + 1
+    for y in range(int(sums[patch.FIRST_ROW]), int(sums[patch.LAST_ROW]) + 1):
+        line, x = stamp[y], int(sums[patch.FIRST_COLUMN])
         top = int(where[patch.TOP]) + y * unit
         last_row = min((top + unit - 1) // t + 1, seen.shape[0])
         while x < columns:
@@ -244,4 +245,4 @@ def _own_plateau(
     start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
     window[1][:] = 0
     patch.grow(window, where, image, start[0], start[1], LEVELS[-1] * least, q[fields.CLIPPED], 1)
-    _own(seen, window[1], where, start)
+    _own(seen, window, where, start)
