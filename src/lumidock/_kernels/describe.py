@@ -79,7 +79,7 @@ def describe(
     if radius <= q[fields.SMALL_PX] * (1.6 if planes == 4 else 1.0) and sums[patch.EDGE] == 0.0:
         sample_noise = noise
         if planes == 4:
-            sample_noise = max(ground[5] / np.sqrt((weight**2).sum()), _LEAST_NOISE * q[fields.MIN_NOISE])
+            sample_noise = max(ground[5] / np.sqrt(samples.square(weight)), _LEAST_NOISE * q[fields.MIN_NOISE])
         balanced = center[0], center[1]
         width = 0.0
         for wider in range(_WIDTHS):
@@ -180,7 +180,8 @@ def _plane_shift(
     if planes != 4:
         return 0.0, 0.0
     stamp, mark, unit = window[1], window[1][start[1], start[0]], int(where[patch.UNIT])
-    total, rim, count = np.zeros((2, 5)), np.zeros((2, 5)), np.zeros((2, 2))  # outside, inside; planes and their mean
+    rim, count = np.zeros((2, 5)), np.zeros((2, 2))  # outside, inside; planes and their mean
+    a = b = c = d = 0.0  # of the planes inside
     sums, rows, columns = window[3], int(where[patch.ROWS]), int(where[patch.COLUMNS])
     left, right = max(int(sums[patch.FIRST_COLUMN]) - 1, 1), min(int(sums[patch.LAST_COLUMN]) + 2, columns - 1)
     for i in range(max(int(sums[patch.FIRST_ROW]) - 1, 1), min(int(sums[patch.LAST_ROW]) + 2, rows - 1)):
@@ -192,22 +193,31 @@ def _plane_shift(
             on_rim = alike < 4 if inside else alike > 0
             if not (inside or on_rim):
                 continue
+            x = int(where[patch.LEFT]) + j * unit
+            value = (
+                scale * samples.sample(image, planes, 0, y, x),
+                scale * samples.sample(image, planes, 1, y, x),
+                scale * samples.sample(image, planes, 2, y, x),
+                scale * samples.sample(image, planes, 3, y, x),
+            )
+            if inside:
+                a, b, c, d = a + value[0], b + value[1], c + value[2], d + value[3]
             count[inside, 0] += 1.0
-            count[inside, 1] += on_rim
+            if not on_rim:
+                continue
+            count[inside, 1] += 1.0
             mixed = 0.0
             for p in range(4):
-                value = scale * samples.sample(image, planes, p, y, int(where[patch.LEFT]) + j * unit)
-                mixed += weight[p] * value
-                total[inside, p] += value
-                rim[inside, p] += on_rim * value
-            rim[inside, 4] += on_rim * mixed
-    share = weight.copy()
+                mixed += weight[p] * value[p]
+                rim[inside, p] += value[p]
+            rim[inside, 4] += mixed
+    share, total = weight.copy(), (a, b, c, d)
     if count[0, 1] > 0.0 and count[1, 1] > 0.0:
         inner, outer = rim[1] / count[1, 1], rim[0] / count[0, 1]
         part = min(max((inner[4] - level) / max(inner[4] - outer[4], 1e-6), 0.0), 1.0)
         for p in range(4):
             contour = inner[p] + part * (outer[p] - inner[p])
-            share[p] *= max(total[1, p] / count[1, 0] - contour, 0.0)
+            share[p] *= max(total[p] / count[1, 0] - contour, 0.0)
     if share.sum() <= 0.0:
         share[:] = weight
     return float((share[1] + share[3]) / share.sum()), float((share[2] + share[3]) / share.sum())

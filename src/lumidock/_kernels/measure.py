@@ -55,8 +55,8 @@ def measure(
         if not samples.stands_out(image, planes, scale, plane, v, u, ring, sigma, _QUICK, small):
             return -1
         samples.weigh(image, planes, scale, v, u, radius, weight)
-    shared = (weight**2 * shared_by_plane).sum() / (weight**2).sum()
-    expected = noise * np.sqrt((weight**2).sum())
+    shared = samples.mean_by_square(weight, shared_by_plane)
+    expected = noise * np.sqrt(samples.square(weight))
     reach = min(max(3.5 * radius, 1.5 * q[fields.RING_PX]), 3.5 * q[fields.MAX_RADIUS_PX])
     # of the surroundings: level, noise, texture that hides a spot, texture that moves it, how far noise is shared, and
     # the noise that shows
@@ -98,7 +98,7 @@ def measure(
     if part == 0.0:
         return 0
     _own(seen, window, where, start)
-    ground[4] = (weight**2 * shared_by_plane**2).sum() / (weight**2).sum()
+    ground[4] = samples.mean_by_square(weight, shared_by_plane**2)
     if planes == 3:  # in the sum of channels fine noise is what JPEG leaves, and coarse noise that of the sensor
         ground[4] = min(max(ground[4] * (expected / ground[1]) ** 2, 1.0), _MOST_SHARED)
     spots[n, fields.CORE] = 0.0

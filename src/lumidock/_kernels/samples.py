@@ -169,9 +169,14 @@ def weigh_clipped(
     radii, most = np.full(4, np.inf), largest
     for p in range(planes - 1, -1, -1):
         top, radius = core_mean(image, planes, scale, p, v, u), 3.0
+        if top < least:
+            continue
         while radius < most:
-            # over the limit it is over half height whatever the background
-            if not _ring_is_over(image, planes, scale, p, v, u, radius, top - 0.5 * least):
+            # else it is over half height whatever the background, or the background is too bright
+            if not (
+                _ring_is_over(image, planes, scale, p, v, u, radius, top - 0.5 * least)
+                or _ring_is_over(image, planes, scale, p, v, u, 3.0 * radius, top - least)
+            ):
                 here = ring_mean(image, planes, scale, p, v, u, radius)
                 dark = ring_mean(image, planes, scale, p, v, u, 3.0 * radius)
                 if here <= top - 0.5 * least and top - dark >= least and here <= 0.5 * (top + dark):
@@ -185,6 +190,24 @@ def weigh_clipped(
         weight[p] = 1.0 if radii[p] <= 1.3 * smallest else 0.0
     weight /= weight.sum()
     return float(smallest)
+
+
+@njit(error_model="numpy")
+def square(weight: Array) -> float:
+    """Sum of the squares of the planes' weights (4,)."""
+    total = 0.0
+    for p in range(4):
+        total += weight[p] * weight[p]
+    return total
+
+
+@njit(error_model="numpy")
+def mean_by_square(weight: Array, values: Array) -> float:
+    """Mean of the planes' `values` (4,) by the squares of their weights."""
+    total = 0.0
+    for p in range(4):
+        total += weight[p] * weight[p] * values[p]
+    return total / square(weight)
 
 
 @njit(error_model="numpy")
