@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lumidock._kernels import fields, gauss, patch, samples
+from lumidock._kernels import constant, fields, gauss, patch, samples
 from lumidock._kernels.patch import Window
 from lumidock.datatypes import Array, Image, Indices
 
@@ -16,7 +16,7 @@ _GRID_OF_FIELD = 0.1  # px, the same of the way between fields, of which each ha
 _WIDTHS = 3  # times the width of what stands over the noise, from which a fit is tried: faint flanks are not seen
 _LEAST_NOISE = 0.7  # of what a search allows for: a sample's rounding, and noise too small to show beside it
 _BETWEEN = np.sqrt(1.0 / 12.0)  # 1 sigma of an instant between two fields, of the way between them
-_FINE_MARK, _SKEW_MARK = 100, 101  # of regions grown again, beside those of the levels tried
+_FINE_MARK, _SKEW_MARK = constant(100), constant(101)  # of regions grown again, beside those of the levels tried
 
 
 @njit(error_model="numpy")

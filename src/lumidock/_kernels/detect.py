@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lumidock._kernels import fields, patch, peaks, tiles
+from lumidock._kernels import constant, fields, patch, peaks, tiles
 from lumidock._kernels.likelihood import dim_glints, dim_small_fry, lamp_probability
 from lumidock._kernels.measure import measure
 from lumidock.datatypes import Array, Image, Indices
@@ -19,7 +19,8 @@ _MOST_WINDOWS = 0.25  # of the frame; for more a full search is cheaper
 _MOST_SHARED = 6.0  # more is a texture
 _NO_LIMIT = 1 << 16  # of a sample
 _NO_CANDIDATE = 1 << 20  # more than there are
-_SWEPT_STEP = 2  # a tracked search's sweep looks at every second row, where the smallest spot still has half its height
+_STAY, _STEP = constant(0), constant(1)  # along rows or columns
+_SWEPT_STEP = constant(2)  # of rows, in a tracked search's sweep: the smallest spot still has half its height
 
 
 @njit(cache=True, error_model="numpy")
@@ -54,9 +55,9 @@ def see(
     if whole:
         count, first, last = 0, 0, blocks
         rects[0, 0], rects[0, 1], rects[0, 2], rects[0, 3] = 0, h, 0, w
-    tiles.survey(rows, planes, (first, last), 1 if whole else _SWEPT_STEP, known)
+    tiles.survey(rows, planes, (first, last), tiles.EVERY if whole else _SWEPT_STEP, known)
     for k in range(count):
-        tiles.refresh(rows, planes, rects[k], 1, known.peak, known.line)
+        tiles.refresh(rows, planes, rects[k], tiles.EVERY, known.peak, known.line)
     if whole or part == SWEEP - 1:
         tiles.settle(known, q[fields.MIN_NOISE] / scale, 1.0 if planes == 4 else _MOST_SHARED)
     return _search(image, planes, scale, known, rects[: count + 1], most, q, spots), whole
@@ -219,8 +220,8 @@ def _peak_pixel(
         # noise in what is clipped in every channel would cut the run short, and a core be measured from its rim
         least, most = white, clipped
     for _ in range(2):
-        row = _middle_of_run(image, planes, p, row, column, 1, 0, least, most, farthest)
-        column = _middle_of_run(image, planes, p, row, column, 0, 1, least, most, farthest)
+        row = _middle_of_run(image, planes, p, row, column, _STEP, _STAY, least, most, farthest)
+        column = _middle_of_run(image, planes, p, row, column, _STAY, _STEP, least, most, farthest)
     return row, column, best > 0
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from lumidock._kernels import constant
 from lumidock._kernels.lens import inside
 from lumidock._kernels.pose import light_row, refine
 from lumidock.datatypes import Array, Indices
@@ -18,13 +19,6 @@ LOG_2PI = math.log(2.0 * math.pi)
 HUGE = 1e300
 _ELSEWHERE = 8.0  # log odds of two priors that one solution under both cannot reach
 _EDGE_PX, _SHINES = 3.0, 0.1  # a light this near the edge, or seen this flat (cosine), may be missing at no cost
-
-
-def constant(value: int) -> int:
-    """A number in numpy's type: numba compiles a function, and all below it, anew for every literal int it is given."""
-    return cast(int, np.int64(value))
-
-
 STEPS = constant(6)  # of Gauss-Newton, at most
 
 

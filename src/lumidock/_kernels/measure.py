@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lumidock._kernels import fields, patch, peaks, samples, tiles
+from lumidock._kernels import constant, fields, patch, peaks, samples, tiles
 from lumidock._kernels.describe import FILTER_PX, describe, index, peak_value, small_snr
 from lumidock._kernels.patch import Window
 from lumidock.datatypes import Array, Image, Indices
@@ -13,6 +13,7 @@ from lumidock.datatypes import Array, Image, Indices
 LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out, until it is round and alone
 _MAX_TILES = 20  # a light is not wider
 _ROUNDS = 4
+_ONLY_MARK = constant(1)
 _QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth having clears 1.8
 # share of a peak's height that a lens that blurs by 0.65 px, 1 sigma, gives the pixels around it; on a mosaic those of
 # other colours get a quarter of it from a lamp of one colour
@@ -244,5 +245,5 @@ def _own_plateau(
     patch.cut(image, planes, scale, weight, v, u, reach, patch.COARSE_SIDE, window[0], where)
     start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
     window[1][:] = 0
-    patch.grow(window, where, image, start[0], start[1], LEVELS[-1] * least, q[fields.CLIPPED], 1)
+    patch.grow(window, where, image, start[0], start[1], LEVELS[-1] * least, q[fields.CLIPPED], _ONLY_MARK)
     _own(seen, window, where, start)
