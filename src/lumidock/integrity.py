@@ -67,12 +67,13 @@ def bounds(beliefs: Sequence[Track], config: IntegrityConfig) -> Bounds:
     for other in beliefs[1:]:
         if first.log_weight - other.log_weight < -math.log(config.risk):
             apart = _apart(first, other)
-            pl = np.maximum(pl, apart + _levels(other, config, np.empty((9, 9))))
+            wider = apart + np.array(_levels(other, config, np.empty((9, 9))))
+            pl = tuple(np.maximum(pl, wider).tolist())
     T_dock_cam = np.eye(4)
     T_dock_cam[:3, :3], T_dock_cam[:3, 3] = first.R.T, -(first.R.T @ first.t)
     x, y, z = first.t.tolist()
     reach = math.sqrt(x * x + y * y + z * z)
-    lateral, axial, angle, bearing, distance = pl.tolist()
+    lateral, axial, angle, bearing, distance = pl
     linear = bearing < _STEEP and min(math.hypot(x, z), math.hypot(y, z)) > _CLEAR * distance
     return Bounds(
         T_dock_cam,
@@ -88,22 +89,20 @@ def bounds(beliefs: Sequence[Track], config: IntegrityConfig) -> Bounds:
     )
 
 
-def _levels(track: Track, config: IntegrityConfig, cov: Array) -> Array:
+def _levels(track: Track, config: IntegrityConfig, cov: Array) -> tuple[float, ...]:
     """Lateral m, axial m, angle rad, bearing rad, range m of one belief; fills `cov` (9, 9)."""
     used = track.n_used
     fault_risk = min(config.risk / (config.fault * max(used, 1)), 0.5)
-    return np.array(
-        levels(
-            track.R,
-            track.t,
-            track.P,
-            track.apart,
-            track.plane,
-            sigma_factors(config.risk),
-            sigma_factors(fault_risk),
-            used >= config.separate_from,
-            cov,
-        )
+    return levels(
+        track.R,
+        track.t,
+        track.P,
+        track.apart,
+        track.plane,
+        sigma_factors(config.risk),
+        sigma_factors(fault_risk),
+        used >= config.separate_from,
+        cov,
     )
 
 

@@ -56,7 +56,8 @@ class Plan:
 
     def count(self, name: Indices) -> list[int]:
         """How many lights of each layer a naming (M,) names."""
-        return np.bincount(self.layer[name >= 0], minlength=self.n_layers).tolist()
+        count: list[int] = np.bincount(self.layer[name >= 0], minlength=self.n_layers).tolist()
+        return count
 
 
 @dataclass(frozen=True, slots=True, eq=False)

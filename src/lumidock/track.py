@@ -310,7 +310,7 @@ def _deviate(square: float, dof: int) -> float:
 
 
 def _plane(count: list[int], plan: Plan, *, joint: bool) -> Array:
-    """A point and the normal (6,) of the plane of all lights named, `count` by layer; NaN where its slant is no question.
+    """A point and the normal (6,) of the plane of all lights named, `count` by layer; NaN where no slant is asked for.
 
     It is none with two layers in view, and with four lights or more of a track that has seen two.
     """

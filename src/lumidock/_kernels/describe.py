@@ -116,7 +116,7 @@ def _size(
 ) -> None:
     """What the region grown at `level` says of a spot: all but its exact centre and covariance."""
     sums, floor, noise, unit = window[3], ground[0], ground[1], where[patch.UNIT]
-    top, area = window[0][start[1], start[0]], sums[patch.N]
+    area = sums[patch.N]
     x, y = start[0] + sums[patch.X] / area, start[1] + sums[patch.Y] / area
     spot[fields.U], spot[fields.V] = where[patch.LEFT] + unit * x, where[patch.TOP] + unit * y
     spot[fields.RADIUS] = np.sqrt(area / np.pi) * unit

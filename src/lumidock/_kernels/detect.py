@@ -110,13 +110,13 @@ def _search(
         np.empty(patch.SUMS),
     )
     while (at < count or n_waiting) and n < len(spots) and work > 0:
-        known = n_waiting > 0 and (at == count or waiting[n_waiting - 1] < queue[at])
-        k = int((waiting[n_waiting - 1] if known else queue[at]) % _NO_CANDIDATE)
-        n_waiting, at = n_waiting - known, at + (not known)
+        ranked = n_waiting > 0 and (at == count or waiting[n_waiting - 1] < queue[at])
+        k = int((waiting[n_waiting - 1] if ranked else queue[at]) % _NO_CANDIDATE)
+        n_waiting, at = n_waiting - ranked, at + (not ranked)
         i, j, p = int(found[k, 0]), int(found[k, 1]), int(found[k, 4])
         if seen[i, j]:
             continue
-        if not known:
+        if not ranked:
             v, u, rank = _brightest(image, planes, p, i, j)
             found[k, 2], found[k, 3] = rank, v * image.shape[1] + u
             if planes == 3 and peak[p, i, j] >= clipped:  # its place in the queue was the best that it could have

@@ -55,9 +55,7 @@ def ring_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int, r
 
 
 @njit(error_model="numpy")
-def _ring_is_over(
-    image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float, limit: float
-) -> bool:
+def _ring_is_over(image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float, limit: float) -> bool:
     """Whether the samples of `ring_mean` say without sorting that it is over a limit: all but a quarter of them are."""
     low, count = 0, 0
     for k in range(0, RING, 2):
