@@ -63,6 +63,8 @@ def _ring_is_over(image: Image, planes: int, scale: float, p: int, v: int, u: in
         if 0 <= x < image.shape[1] and 0 <= y < image.shape[0]:
             low += scale * sample(image, planes, p, y, x) <= limit
             count += 1
+        if low > RING // 8:
+            return False
     return low <= count // 4 and count > 0
 
 
