@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from lumidock._kernels.evidence import HUGE, Naming, Scene, constant, innovation, survey_var
+from lumidock._kernels import constant
+from lumidock._kernels.evidence import HUGE, Naming, Scene, innovation, survey_var
 from lumidock._kernels.pose import light_row
 from lumidock.datatypes import Array, Indices
 

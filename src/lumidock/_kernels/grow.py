@@ -7,13 +7,13 @@ import math
 import numpy as np
 from numba import njit
 
+from lumidock._kernels import constant
 from lumidock._kernels.evidence import (
     GATE,
     HUGE,
     STEPS,
     Naming,
     Scene,
-    constant,
     copied,
     fit,
     keep,

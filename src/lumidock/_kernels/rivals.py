@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
+from lumidock._kernels import constant
 from lumidock._kernels.evidence import (
     GATE,
     HUGE,
@@ -14,7 +15,6 @@ from lumidock._kernels.evidence import (
     STEPS,
     Naming,
     Scene,
-    constant,
     copied,
     evidence,
     innovation,

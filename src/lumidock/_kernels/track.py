@@ -251,6 +251,20 @@ def look(lens: Array, state: State, p: Array, axis: Array, out: Foreseen) -> Non
 
 
 @njit(cache=True, error_model="numpy")
+def windows(foreseen: Foreseen, margin_px: float, most_px: float, out: Array) -> int:
+    """Write u, v and reach px, four sigmas and a margin, of each light in sight to `out` (M, 3); how many there are."""
+    expected, S, shown = foreseen
+    count = 0
+    for c in range(len(shown)):
+        u, v, a, b = expected[c, 0], expected[c, 1], S[2 * c, 2 * c], S[2 * c + 1, 2 * c + 1]
+        if shown[c] > 0.0 and math.isfinite(u) and math.isfinite(v) and not (math.isnan(a) or math.isnan(b)):
+            reach = 4.0 * math.sqrt(max(a, b, 0.0)) + margin_px
+            out[count, 0], out[count, 1], out[count, 2] = u, v, min(reach, most_px)
+            count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")
 def _shines(state: State, p: Array, axis: Array, c: int) -> bool:
     """Whether light `c` sends its light toward the camera."""
     R, t, x = state.R, state.t, state.x

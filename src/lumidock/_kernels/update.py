@@ -132,10 +132,14 @@ def _whiten(lens: Array, p: Array, state: State, pixels: Pixels, rows: _Rows) ->
     if math.isnan(factor(Z, 2 * m)):
         return False
     for r in range(2 * m):
-        for k in range(r):
-            z = Z[r, k]
+        for k in range(0, r - 1, 2):
+            y, z = Z[r, k], Z[r, k + 1]
             for j in range(n):
-                G[r, j] -= z * G[k, j]
+                G[r, j] = G[r, j] - y * G[k, j] - z * G[k + 1, j]
+        if r % 2:
+            z = Z[r, r - 1]
+            for j in range(n):
+                G[r, j] -= z * G[r - 1, j]
         z = 1.0 / Z[r, r]
         for j in range(n):
             G[r, j] *= z
@@ -175,14 +179,15 @@ def _forward(Z: Array, nu: Array, w: Array) -> None:
 
 @njit(cache=True, error_model="numpy")
 def _shrink(P: Array, G: Array, estimated: int) -> None:
-    """Take the information of an update out of `P` (n, n), but not from what is only considered."""
-    n = len(P)
-    for r in range(len(G)):
-        for i in range(n):
-            g = G[r, i]
-            end = n if i < estimated else estimated
+    """Take the information of an update out of `P` (n, n), but not from what is only considered; `G` (2 m, n)."""
+    for i in range(len(P)):
+        end = i + 1 if i < estimated else estimated
+        for r in range(0, len(G), 2):
+            u, v = G[r, i], G[r + 1, i]
             for j in range(end):
-                P[i, j] -= g * G[r, j]
+                P[i, j] = P[i, j] - u * G[r, j] - v * G[r + 1, j]
+        for j in range(end):
+            P[j, i] = P[i, j]
 
 
 @njit(cache=True, error_model="numpy")
@@ -194,16 +199,20 @@ def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
     G^T V (V^T V)^-1 V^T G: block elimination, exact also where states are only considered.
     """
     lights, Z, G, m = rows.lights, rows.Z, rows.G, len(rows.lights)
-    V, U = np.empty((2 * m, 2)), np.empty((9, 2))
+    V, U, Y = np.empty((2 * m, 2)), np.empty((9, 2)), np.empty((2, 6))
     apart[:] = 0.0
     for k in range(m):
         a = b = d = wu = wv = 0.0
+        Y[:] = 0.0
         for r in range(2 * k, 2 * m):
-            for o in range(2):
-                s = 1.0 if r == 2 * k + o else 0.0
-                for q in range(2 * k, r):
-                    s -= Z[r, q] * V[q, o]
-                V[r, o] = s / Z[r, r]
+            su, sv = 1.0 if r == 2 * k else 0.0, 1.0 if r == 2 * k + 1 else 0.0
+            for q in range(2 * k, r):
+                su -= Z[r, q] * V[q, 0]
+                sv -= Z[r, q] * V[q, 1]
+            V[r, 0], V[r, 1] = su / Z[r, r], sv / Z[r, r]
+            for o in range(6):
+                Y[0, o] += G[r, o] * V[r, 0]
+                Y[1, o] += G[r, o] * V[r, 1]
             a += V[r, 0] * V[r, 0]
             b += V[r, 0] * V[r, 1]
             d += V[r, 1] * V[r, 1]
@@ -213,12 +222,8 @@ def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
         for j in range(9):
             U[j, 0] = U[j, 1] = 0.0
             for o in range(6):
-                gu = gv = 0.0
-                for r in range(2 * k, 2 * m):
-                    gu += G[r, o] * V[r, 0]
-                    gv += G[r, o] * V[r, 1]
-                U[j, 0] += C[j, o] * gu
-                U[j, 1] += C[j, o] * gv
+                U[j, 0] += C[j, o] * Y[0, o]
+                U[j, 1] += C[j, o] * Y[1, o]
         c = lights[k]
         for j in range(9):
             u, v = (d * U[j, 0] - b * U[j, 1]) / det, (a * U[j, 1] - b * U[j, 0]) / det
