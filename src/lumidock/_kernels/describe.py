@@ -19,7 +19,7 @@ _BETWEEN = np.sqrt(1.0 / 12.0)  # 1 sigma of an instant between two fields, of t
 _FINE_MARK, _SKEW_MARK = constant(100), constant(101)  # of regions grown again, beside those of the levels tried
 
 
-@njit(error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def describe(
     image: Image,
     planes: int,

@@ -63,7 +63,7 @@ def see(
     return _search(image, planes, scale, known, rects[: count + 1], most, q, spots), whole
 
 
-@njit(error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _search(
     image: Image,
     planes: int,

@@ -60,7 +60,7 @@ class Naming(NamedTuple):
     t: Array
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def copied(one: Naming) -> Naming:
     """The same hypothesis in arrays of its own."""
     return Naming(one.name.copy(), one.R.copy(), one.t.copy())
@@ -81,7 +81,7 @@ def keep(e: float, best: float, one: Naming, better: Naming) -> float:
     return e
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def survey_var(lens: Array, R: Array, t: Array, p: Array, survey_m2: float) -> float:
     """Variance px^2 that the survey error of a light at `p` (3,) adds."""
     z = max(R[2, 0] * p[0] + R[2, 1] * p[1] + R[2, 2] * p[2] + t[2], 0.05)
@@ -137,7 +137,7 @@ def log_evidence(one: Naming, scene: Scene, info: Array, fitted: tuple[float, fl
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _shines(scene: Scene, R: Array, t: Array, c: int) -> bool:
     """Whether light `c` sends its light toward the camera, which stands at -R^T t."""
     norm, along = 0.0, 0.0
@@ -173,7 +173,7 @@ def solved(one: Naming, scene: Scene, info: Array, steps: int, H: Array, L: Arra
     return log_evidence(one, scene, info, fit(one, scene, info, steps, H, L))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def log_add(a: float, b: float) -> float:
     """Logarithm of the sum of two numbers from their logarithms."""
     high, low = max(a, b), min(a, b)
@@ -203,7 +203,7 @@ def named(name: Indices) -> int:
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def named_lights(name: Indices) -> Indices:
     """The lights (K,) that a naming names."""
     lights, n = np.empty(named(name), np.int64), 0
@@ -214,7 +214,7 @@ def named_lights(name: Indices) -> Indices:
     return lights
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def named_points(name: Indices, p: Array) -> Array:
     """Positions (K, 3) of the lights that a naming names."""
     lights = named_lights(name)
