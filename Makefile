@@ -19,7 +19,8 @@ demo: setup
 	@$(BIN)/lumidock demo --force
 
 test: lint
-	@$(BIN)/python -m pytest
+	@$(BIN)/lumidock warm  # or every worker would compile the same
+	@$(BIN)/python -m pytest -n auto --dist loadfile
 
 slow: setup
 	@$(BIN)/python -m pytest -m slow

@@ -279,6 +279,24 @@ def test_after_a_long_black_out_the_search_begins_anew():
     assert all(wrong_names(x, f.light) == 0 for f, x in zip(frames, fixes, strict=True))
 
 
+def test_names_that_few_lights_carried_too_long_are_proven_anew():
+    """Three lights fit many poses: after two seconds of them the first frame with all is not believed by itself."""
+    settings = ("path.start_z_m=14", "path.end_z_m=8", "path.frame_interval_s=0.0666667")
+    frames, few = frames_of("approach", *settings, seed=3), slice(30, 62)
+    seen = [frame.detections for frame in frames]
+    for k in range(few.start, few.stop):
+        three = np.flatnonzero(frames[k].light >= 0)[:3]
+        seen[k] = Detections.from_uv(seen[k].frame, seen[k].t_ns, seen[k].uv[three])
+    localizer = Localizer(STATION, CAMERA)
+    fixes = [localizer.process_detections(detections) for detections in seen]
+    assert all(fix.valid for fix in fixes[few.start - 5 : few.start])
+    assert all(fix.n_used == 3 for fix in fixes[few.stop - 3 : few.stop])
+    assert fixes[few.stop].n_used >= 6
+    assert not fixes[few.stop].valid
+    assert fixes[few.stop].guide is None
+    assert all(fix.valid for fix in fixes[few.stop + 1 : few.stop + 5])
+
+
 def test_a_stamp_that_does_not_follow_gives_no_fix():
     seen, localizer = nearby(), Localizer(STATION, CAMERA)
     assert [localizer.process_detections(d) for d in seen[:6]][-1].valid

@@ -67,12 +67,13 @@ def bounds(beliefs: Sequence[Track], config: IntegrityConfig) -> Bounds:
     for other in beliefs[1:]:
         if first.log_weight - other.log_weight < -math.log(config.risk):
             apart = _apart(first, other)
-            pl = np.maximum(pl, apart + _levels(other, config, np.empty((9, 9))))
+            wider = apart + np.array(_levels(other, config, np.empty((9, 9))))
+            pl = tuple(np.maximum(pl, wider).tolist())
     T_dock_cam = np.eye(4)
     T_dock_cam[:3, :3], T_dock_cam[:3, 3] = first.R.T, -(first.R.T @ first.t)
     x, y, z = first.t.tolist()
     reach = math.sqrt(x * x + y * y + z * z)
-    lateral, axial, angle, bearing, distance = pl.tolist()
+    lateral, axial, angle, bearing, distance = pl
     linear = bearing < _STEEP and min(math.hypot(x, z), math.hypot(y, z)) > _CLEAR * distance
     return Bounds(
         T_dock_cam,
@@ -88,22 +89,20 @@ def bounds(beliefs: Sequence[Track], config: IntegrityConfig) -> Bounds:
     )
 
 
-def _levels(track: Track, config: IntegrityConfig, cov: Array) -> Array:
+def _levels(track: Track, config: IntegrityConfig, cov: Array) -> tuple[float, ...]:
     """Lateral m, axial m, angle rad, bearing rad, range m of one belief; fills `cov` (9, 9)."""
     used = track.n_used
     fault_risk = min(config.risk / (config.fault * max(used, 1)), 0.5)
-    return np.array(
-        levels(
-            track.R,
-            track.t,
-            track.P,
-            track.apart,
-            track.plane,
-            sigma_factors(config.risk),
-            sigma_factors(fault_risk),
-            used >= config.separate_from,
-            cov,
-        )
+    return levels(
+        track.R,
+        track.t,
+        track.P,
+        track.apart,
+        track.plane,
+        sigma_factors(config.risk),
+        sigma_factors(fault_risk),
+        used >= config.separate_from,
+        cov,
     )
 
 
@@ -157,9 +156,9 @@ def guide_holds(bound: Bounds) -> bool:
 
 def stage(track: Track, plan: Plan) -> Stage | None:
     """Docking stage by the layers that the pose rests on (paper section 2.2); None without a light."""
-    count = np.bincount(plan.layer[track.name >= 0], minlength=plan.n_layers)
-    rear = int(count[plan.is_rear == 1].sum())
-    front = int(count.sum()) - rear
+    count = plan.count(track.name)
+    rear = sum(c for c, is_rear in zip(count, plan.is_rear, strict=True) if is_rear)
+    front = sum(count) - rear
     if front and rear:
         return "transition"
     return "rear" if rear else "front" if front else None

@@ -188,8 +188,8 @@ class Localizer:
 
     def _fits(self, belief: Track, seen: Spots) -> bool:
         """Whether a followed belief passes its innovation test and leaves no array's worth of spots unexplained."""
-        unexplained = seen.lamps - belief.n_used
-        explains = belief.n_used >= _MIN_LIGHTS or unexplained < _MIN_SOLID
+        used = belief.n_used
+        explains = used >= _MIN_LIGHTS or seen.lamps - used < _MIN_SOLID
         return explains and verify.innovation_holds(belief, self.config.track)
 
     def _doubt(self, followed: list[Track], seen: Spots) -> str:
@@ -285,7 +285,7 @@ class Localizer:
         first, config = self.beliefs[0], self.config.integrity
         bound = integrity.bounds(self.beliefs, config)
         proven = verify.is_proven(first, self.margin, config)
-        valid = proven and integrity.pose_holds(bound)
+        valid, used = proven and integrity.pose_holds(bound), first.n_used
         self._stage = integrity.stage(first, self._plan) or self._stage
         return Fix(
             detections.frame,
@@ -293,14 +293,14 @@ class Localizer:
             status,
             self._stage,
             n_seen=len(detections),
-            n_used=first.n_used,
+            n_used=used,
             T_dock_cam=bound.T_dock_cam if valid else None,
             reason="" if valid else "protection" if proven else "ambiguous",
             match=Match(detections, match.light_of(first.name, len(detections))),
             covariance=bound.covariance if valid else None,
             protection=bound.protection if valid else None,
             guide=bound.guide if proven and integrity.guide_holds(bound) else None,
-            nis=first.nis / (2 * first.n_used) if status == "tracking" else math.nan,
+            nis=first.nis / (2 * used) if status == "tracking" else math.nan,
         )
 
     def _coast(self, detections: Detections, reason: str) -> Fix:

@@ -54,6 +54,11 @@ class Plan:
     log_volume: float
     sigma_focal: float
 
+    def count(self, name: Indices) -> list[int]:
+        """How many lights of each layer a naming (M,) names."""
+        count: list[int] = np.bincount(self.layer[name >= 0], minlength=self.n_layers).tolist()
+        return count
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
@@ -199,15 +204,13 @@ def spots(detections: Detections, plan: Plan, config: MatchConfig) -> Spots:
     A spot that looks like no lamp may be more, or less, than one: its centre is worth a share of its radius.
     """
     uv, n = np.ascontiguousarray(detections.uv), len(detections)
-    p_light = np.where(np.isnan(detections.p_light), 1.0, detections.p_light)
-    radius_px = np.fmin(detections.radius_px, _RADIUS_PX)
-    strange_px = config.strange * np.maximum(1.0 - p_light / _STRANGE, 0.0) * radius_px
     cov = np.empty((n, 2, 2))
     cov[:] = np.eye(2) * config.noise_px**2 if detections.cov_px2 is None else detections.cov_px2
-    cov += (strange_px**2)[:, None, None] * np.eye(2)
-    var, like = np.empty(n), np.empty((n, plan.n_layers))
-    p_rear, lamp = np.ascontiguousarray(detections.p_rear), np.ascontiguousarray(detections.p_light)
-    span = kernel.weigh(uv, cov, p_rear, lamp, plan.is_rear, config.label_trust, like, var)
+    p_light, var, like = np.empty(n), np.empty(n), np.empty((n, plan.n_layers))
+    p_light[:] = detections.p_light
+    radius_px, p_rear = np.ascontiguousarray(detections.radius_px), np.ascontiguousarray(detections.p_rear)
+    strange = config.strange, _RADIUS_PX, _STRANGE
+    span = kernel.weigh(uv, radius_px, p_rear, plan.is_rear, config.label_trust, strange, cov, p_light, like, var)
     whole, share = plan.lens[6] * plan.lens[7], config.clutter_near
     box = min(span + config.clutter_margin_px**2, whole) if n else whole
     density = (1.0 - share) / whole + share / box

@@ -154,10 +154,11 @@ def start_states(station: Station, attitude: Attitude | None, config: TrackConfi
 
 
 def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
-    """The track at a later time, its twist held but for white noise on it."""
+    """The track at a later time, its twist held but for white noise on it; what agreed too long ago proves nothing."""
     R, t, P = track.R.copy(), track.t.copy(), track.P.copy()
     kernel.predict(R, t, track.x[6:12], P, (t_ns - track.t_ns) * 1e-9, config.accel_m_s2**2, config.accel_rad_s2**2)
-    return replace(track, t_ns=t_ns, R=R, t=t, P=P)
+    lately = t_ns - track.agreed_ns <= config.max_gap_s * 1e9
+    return replace(track, t_ns=t_ns, R=R, t=t, P=P, proof=track.proof if lately else 0)
 
 
 def attend(track: Track, attitude: Attitude) -> Track:
@@ -173,12 +174,8 @@ def attend(track: Track, attitude: Attitude) -> Track:
 
 def foresee(foreseen: Foreseen) -> Array:
     """Where the lights of a predicted track will be seen: (n, 3) u, v and reach, four sigmas and a margin, px."""
-    expected, S, shown = foreseen
-    variance = S.diagonal().reshape(-1, 2).max(axis=1)
-    windows = np.empty((len(shown), 3))
-    windows[:, :2] = expected
-    windows[:, 2] = np.minimum(4.0 * np.sqrt(np.maximum(variance, 0.0)) + _MARGIN_PX, _MAX_REACH_PX)
-    return windows[(shown > 0.0) & np.isfinite(windows).all(axis=1)]
+    windows = np.empty((len(foreseen.shown), 3))
+    return windows[: kernel.windows(foreseen, _MARGIN_PX, _MAX_REACH_PX, windows)]
 
 
 def look(track: Track, plan: Plan) -> Foreseen:
@@ -206,9 +203,12 @@ def associate(track: Track, seen: Spots, plan: Plan, config: Config, foreseen: F
     in the wide gate of a single light would set it.
     """
     foreseen = foreseen or look(track, plan)
-    known = (track.t_ns - track.layer_ns <= config.track.max_gap_s * 1e9)[plan.layer]
+    lately = track.t_ns - track.layer_ns <= config.track.max_gap_s * 1e9
+    if lately.all():
+        return _search(foreseen, seen, plan, config)
+    known = lately[plan.layer]
     best = _search(foreseen._replace(shown=np.where(known, foreseen.shown, 0.0)), seen, plan, config)
-    if not known.all() and foreseen.shown[~known].any():
+    if foreseen.shown[~known].any():
         wider = _search(foreseen, seen, plan, config)
         new = np.bincount(plan.layer[(wider.name >= 0) & ~known], minlength=plan.n_layers)
         enters = (new == 0) | (new >= LAYER_LIGHTS)
@@ -252,7 +252,7 @@ def update(
     A single plane is linearised as flat as `turn_cov` (3, 3), by default the track's own, lets it be. From the first
     frame on that names `joint_lights` lights of two layers, calibration and light positions move too.
     """
-    count = np.bincount(plan.layer[name >= 0], minlength=plan.n_layers)
+    count = plan.count(name)
     joint = track.joint or _is_joint(count, config)
     R0, t0, x, P = track.R, track.t, track.x.copy(), track.P.copy()
     R, t = (track.R.copy(), track.t.copy()) if at is None else (at[:3, :3].copy(), at[:3, 3].copy())
@@ -273,14 +273,14 @@ def update(
     )
     if not math.isfinite(nis):
         return None
-    used = int(count.sum())
-    layer_ns = np.where((count >= LAYER_LIGHTS) | (track.layer_ns > _NEVER) & (count > 0), track.t_ns, track.layer_ns)
+    used, t_ns = sum(count), track.t_ns
+    before = zip(count, track.layer_ns.tolist(), strict=True)
+    layer_ns = [t_ns if c >= LAYER_LIGHTS or (c > 0 and was > _NEVER) else was for c, was in before]
     # a pose of which nothing was known takes up six of the pixels' degrees of freedom
     dof = 2 * used - (0 if at is None else 6)
     surprise = _deviate(nis, dof) if dof > 0 else 0.0
     agreed_ns = track.t_ns if used >= _PROOF_LIGHTS else track.agreed_ns
-    lately = track.t_ns - track.agreed_ns <= config.max_gap_s * 1e9
-    proof = (track.proof if lately else 0) + int(agreed_ns == track.t_ns)
+    proof = track.proof + int(agreed_ns == track.t_ns)
     return Track(
         track.t_ns,
         track.began_ns,
@@ -293,7 +293,7 @@ def update(
         proof,
         track.t_ns,
         agreed_ns,
-        layer_ns,
+        np.array(layer_ns, np.int64),
         name,
         apart,
         plane,
@@ -309,23 +309,23 @@ def _deviate(square: float, dof: int) -> float:
     return float(((square / dof) ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(spread))
 
 
-def _plane(count: Indices, plan: Plan, *, joint: bool) -> Array:
-    """A point and the normal (6,) of the plane of all lights named, `count` (L,); NaN where its slant is no question.
+def _plane(count: list[int], plan: Plan, *, joint: bool) -> Array:
+    """A point and the normal (6,) of the plane of all lights named, `count` by layer; NaN where no slant is asked for.
 
     It is none with two layers in view, and with four lights or more of a track that has seen two.
     """
-    most = int(count.argmax())
-    alone = 0 < count[most] == count.sum() and not (joint and count[most] >= _PROOF_LIGHTS)
-    return plan.planes[most] if alone else NO_PLANE
+    most = max(count)
+    alone = 0 < most == sum(count) and not (joint and most >= _PROOF_LIGHTS)
+    return plan.planes[count.index(most)] if alone else NO_PLANE
 
 
 def is_joint(name: Indices, plan: Plan, config: TrackConfig) -> bool:
     """Whether at least two layers show enough lights."""
-    return _is_joint(np.bincount(plan.layer[name >= 0], minlength=plan.n_layers), config)
+    return _is_joint(plan.count(name), config)
 
 
-def _is_joint(count: Indices, config: TrackConfig) -> bool:
-    return int((count >= config.joint_lights).sum()) >= 2
+def _is_joint(count: list[int], config: TrackConfig) -> bool:
+    return sum(c >= config.joint_lights for c in count) >= 2
 
 
 def learned(track: Track) -> tuple[Array, Array]:

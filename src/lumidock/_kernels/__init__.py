@@ -7,8 +7,15 @@ one of these changes, it is stale. So whatever was compiled from other sources i
 import hashlib
 from contextlib import suppress
 from pathlib import Path
+from typing import cast
 
+import numpy as np
 from numba import njit
+
+
+def constant(value: int) -> int:
+    """A number in numpy's type: numba compiles a function, and all below it, anew for every literal int it is given."""
+    return cast(int, np.int64(value))
 
 
 @njit(cache=True)

@@ -122,18 +122,17 @@ def _is_burnt(image: Image, scale: float, clipped: float, u: float, v: float, re
     return False
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"reassoc", "contract"})
 def _clipped_moments(values: Array) -> tuple[float, float]:
     """Mean and standard deviation without outliers."""
     level, spread = 0.0, np.inf
     for _ in range(_CLIP_ROUNDS + 1):
         total, squares, count = 0.0, 0.0, 0
         for x in values:
-            d = x - level
-            if abs(d) <= _CLIP * spread:
-                total += d
-                squares += d * d
-                count += 1
+            d, kept = x - level, abs(x - level) <= _CLIP * spread
+            total += d if kept else 0.0
+            squares += d * d if kept else 0.0
+            count += kept
         if count == 0:
             break
         shift = total / count

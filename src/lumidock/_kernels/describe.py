@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lumidock._kernels import fields, gauss, patch, samples
+from lumidock._kernels import constant, fields, gauss, patch, samples
 from lumidock._kernels.patch import Window
 from lumidock.datatypes import Array, Image, Indices
 
@@ -25,10 +25,10 @@ _FINER = 1.6  # times the samples that a picture of one plane has of an edge: co
 _PLATEAU = 0.9  # of the height; less is edge
 _WIDEST_PX2 = 500.0  # area of a spot whose edge is told from its inside; of a wider one it matters little
 _HAZE, _HAZE_PX = 0.28, 8.0  # px, 1 sigma, by a halo as bright as the spot; in proportion to the radius up to this one
-_FINE_MARK, _SKEW_MARK = 100, 101  # of regions grown again, beside those of the levels tried
+_FINE_MARK, _SKEW_MARK = constant(100), constant(101)  # of regions grown again, beside those of the levels tried
 
 
-@njit(error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def describe(
     image: Image,
     planes: int,
@@ -95,7 +95,7 @@ def describe(
     if radius <= q[fields.SMALL_PX] * (1.6 if planes == 4 else 1.0) and sums[patch.EDGE] == 0.0:
         sample_noise = noise
         if planes == 4:
-            sample_noise = max(ground[5] / np.sqrt((weight**2).sum()), _LEAST_NOISE * q[fields.MIN_NOISE])
+            sample_noise = max(ground[5] / np.sqrt(samples.square(weight)), _LEAST_NOISE * q[fields.MIN_NOISE])
         balanced = center[0], center[1]
         width = 0.0
         for wider in range(_WIDTHS):
@@ -133,11 +133,10 @@ def _size(
 ) -> None:
     """What the region grown at `level` says of a spot: all but its exact centre and covariance."""
     sums, floor, noise, unit = window[3], ground[0], ground[1], where[patch.UNIT]
-    top, area = window[0][start[1], start[0]], sums[patch.N]
+    area = sums[patch.N]
     x, y = start[0] + sums[patch.X] / area, start[1] + sums[patch.Y] / area
     spot[fields.U], spot[fields.V] = where[patch.LEFT] + unit * x, where[patch.TOP] + unit * y
     spot[fields.RADIUS] = np.sqrt(area / np.pi) * unit
-    spot[fields.HALO] = _around(window[0], where, start, sums, 2.0, floor) / max(top - floor, 1e-6)
     flux = sums[patch.W] + area * (level - floor)
     spot[fields.FLUX] = flux * unit * unit
     spot[fields.SNR] = flux / (area * np.sqrt(shared * noise**2 / area + ground[2] ** 2))
@@ -191,20 +190,6 @@ def peak_value(part: Array, where: Array, start: Indices) -> float:
 
 
 @njit(error_model="numpy")
-def _around(part: Array, where: Array, start: Indices, sums: Array, radii: float, floor: float) -> float:
-    """Mean level over the floor on a circle around a region's centre, of so many of its radii."""
-    radius = radii * np.sqrt(sums[patch.N] / np.pi) + 1.0
-    x, y = start[0] + sums[patch.X] / sums[patch.N], start[1] + sums[patch.Y] / sums[patch.N]
-    total, count = 0.0, 0
-    for k in range(12):
-        a, b = int(x + radius * samples.COS[2 * k] + 0.5), int(y + radius * samples.SIN[2 * k] + 0.5)
-        if 0 <= a < where[patch.COLUMNS] and 0 <= b < where[patch.ROWS]:
-            total += part[b, a] - floor
-            count += 1
-    return total / max(count, 1)
-
-
-@njit(error_model="numpy")
 def _plane_shift(
     image: Image, planes: int, scale: float, weight: Array, window: Window, where: Array, start: Indices, level: float
 ) -> tuple[float, float]:
@@ -217,32 +202,44 @@ def _plane_shift(
     if planes != 4:
         return 0.0, 0.0
     stamp, mark, unit = window[1], window[1][start[1], start[0]], int(where[patch.UNIT])
-    total, rim, count = np.zeros((2, 5)), np.zeros((2, 5)), np.zeros((2, 2))  # outside, inside; planes and their mean
-    for i in range(1, int(where[patch.ROWS]) - 1):
+    rim, count = np.zeros((2, 5)), np.zeros((2, 2))  # outside, inside; planes and their mean
+    a = b = c = d = 0.0  # of the planes inside
+    sums, rows, columns = window[3], int(where[patch.ROWS]), int(where[patch.COLUMNS])
+    left, right = max(int(sums[patch.FIRST_COLUMN]) - 1, 1), min(int(sums[patch.LAST_COLUMN]) + 2, columns - 1)
+    for i in range(max(int(sums[patch.FIRST_ROW]) - 1, 1), min(int(sums[patch.LAST_ROW]) + 2, rows - 1)):
         y = int(where[patch.TOP]) + i * unit
-        for j in range(1, int(where[patch.COLUMNS]) - 1):
+        for j in range(left, right):
             inside = int(stamp[i, j] == mark)
             alike = (stamp[i - 1, j] == mark) + (stamp[i + 1, j] == mark)
             alike += (stamp[i, j - 1] == mark) + (stamp[i, j + 1] == mark)
             on_rim = alike < 4 if inside else alike > 0
             if not (inside or on_rim):
                 continue
+            x = int(where[patch.LEFT]) + j * unit
+            value = (
+                scale * samples.sample(image, planes, 0, y, x),
+                scale * samples.sample(image, planes, 1, y, x),
+                scale * samples.sample(image, planes, 2, y, x),
+                scale * samples.sample(image, planes, 3, y, x),
+            )
+            if inside:
+                a, b, c, d = a + value[0], b + value[1], c + value[2], d + value[3]
             count[inside, 0] += 1.0
-            count[inside, 1] += on_rim
+            if not on_rim:
+                continue
+            count[inside, 1] += 1.0
             mixed = 0.0
             for p in range(4):
-                value = scale * samples.sample(image, planes, p, y, int(where[patch.LEFT]) + j * unit)
-                mixed += weight[p] * value
-                total[inside, p] += value
-                rim[inside, p] += on_rim * value
-            rim[inside, 4] += on_rim * mixed
-    share = weight.copy()
+                mixed += weight[p] * value[p]
+                rim[inside, p] += value[p]
+            rim[inside, 4] += mixed
+    share, total = weight.copy(), (a, b, c, d)
     if count[0, 1] > 0.0 and count[1, 1] > 0.0:
         inner, outer = rim[1] / count[1, 1], rim[0] / count[0, 1]
         part = min(max((inner[4] - level) / max(inner[4] - outer[4], 1e-6), 0.0), 1.0)
         for p in range(4):
             contour = inner[p] + part * (outer[p] - inner[p])
-            share[p] *= max(total[1, p] / count[1, 0] - contour, 0.0)
+            share[p] *= max(total[p] / count[1, 0] - contour, 0.0)
     if share.sum() <= 0.0:
         share[:] = weight
     return float((share[1] + share[3]) / share.sum()), float((share[2] + share[3]) / share.sum())
@@ -264,12 +261,13 @@ def _edge(
 
     In the picture as it is, for the window may be smoothed. Infinite for a wide spot.
     """
-    stamp, mark, unit, area = window[1], window[1][start[1], start[0]], int(where[patch.UNIT]), window[3][patch.N]
+    stamp, sums, mark, unit = window[1], window[3], window[1][start[1], start[0]], int(where[patch.UNIT])
+    area = sums[patch.N]
     if area * unit * unit > _WIDEST_PX2:
         return np.inf
     high, inner = floor + _PLATEAU * (top - floor), 0.0
-    for i in range(int(where[patch.ROWS])):
-        for j in range(int(where[patch.COLUMNS])):
+    for i in range(int(sums[patch.FIRST_ROW]), int(sums[patch.LAST_ROW]) + 1):
+        for j in range(int(sums[patch.FIRST_COLUMN]), int(sums[patch.LAST_COLUMN]) + 1):
             if stamp[i, j] == mark:
                 y, x, value = int(where[patch.TOP]) + i * unit, int(where[patch.LEFT]) + j * unit, 0.0
                 for p in range(planes):
@@ -327,8 +325,8 @@ def _unresolved(sums: Array, q: Array, unit: float) -> tuple[float, float, float
 @njit(error_model="numpy")
 def _is_known(spots: Array, n: int) -> bool:
     for k in range(n):
-        if np.hypot(spots[k, fields.U] - spots[n, fields.U], spots[k, fields.V] - spots[n, fields.V]) < max(
-            0.7 * spots[k, fields.RADIUS], 1.5
-        ):
+        du, dv = spots[k, fields.U] - spots[n, fields.U], spots[k, fields.V] - spots[n, fields.V]
+        near = max(0.7 * spots[k, fields.RADIUS], 1.5)
+        if abs(du) < near and abs(dv) < near and np.hypot(du, dv) < near:
             return True
     return False

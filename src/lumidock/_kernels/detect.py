@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lumidock._kernels import fields, patch, peaks, tiles
+from lumidock._kernels import constant, fields, patch, peaks, tiles
 from lumidock._kernels.likelihood import dim_glints, dim_small_fry, lamp_probability
 from lumidock._kernels.measure import measure
 from lumidock.datatypes import Array, Image, Indices
@@ -18,7 +18,9 @@ _DRIFT_PX = 20.0  # around a spot, in which it is looked for in the next frame
 _MOST_WINDOWS = 0.25  # of the frame; for more a full search is cheaper
 _MOST_SHARED = 6.0  # more is a texture
 _NO_LIMIT = 1 << 16  # of a sample
-_SWEPT_STEP = 2  # a tracked search's sweep looks at every second row, where the smallest spot still has half its height
+_NO_CANDIDATE = 1 << 20  # more than there are
+_STAY, _STEP = constant(0), constant(1)  # along rows or columns
+_SWEPT_STEP = constant(2)  # of rows, in a tracked search's sweep: the smallest spot still has half its height
 
 
 @njit(cache=True, error_model="numpy")
@@ -53,15 +55,15 @@ def see(
     if whole:
         count, first, last = 0, 0, blocks
         rects[0, 0], rects[0, 1], rects[0, 2], rects[0, 3] = 0, h, 0, w
-    tiles.survey(rows, planes, (first, last), 1 if whole else _SWEPT_STEP, known)
+    tiles.survey(rows, planes, (first, last), tiles.EVERY if whole else _SWEPT_STEP, known)
     for k in range(count):
-        tiles.refresh(rows, planes, rects[k], 1, known.peak, known.line)
+        tiles.refresh(rows, planes, rects[k], tiles.EVERY, known.peak, known.line)
     if whole or part == SWEEP - 1:
         tiles.settle(known, q[fields.MIN_NOISE] / scale, 1.0 if planes == 4 else _MOST_SHARED)
     return _search(image, planes, scale, known, rects[: count + 1], most, q, spots), whole
 
 
-@njit(error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _search(
     image: Image,
     planes: int,
@@ -97,7 +99,7 @@ def _search(
             found[count : count + more, 4] = p
             count += more
     count = _most_outstanding(found, count, most[0])
-    order = _brightest_first(image, planes, peak, int(clipped), found, count)
+    queue, waiting, at, n_waiting = _brightest_first(planes, peak, int(clipped), found, count), np.empty(count), 0, 0
     tiles.clear(seen, rects)  # from here on: tiles of spots
     n, work = 0, most[1]
     side = patch.SIDE + 16
@@ -105,16 +107,23 @@ def _search(
         np.empty((side, side)),
         np.zeros((side, side), np.int16),
         np.empty((side * side, 2), np.int32),
-        np.empty(12),
+        np.empty(patch.SUMS),
     )
-    for k in order:
-        if n == len(spots) or work <= 0:
-            break
-        i, j = int(found[k, 0]), int(found[k, 1])
+    while (at < count or n_waiting) and n < len(spots) and work > 0:
+        ranked = n_waiting > 0 and (at == count or waiting[n_waiting - 1] < queue[at])
+        k = int((waiting[n_waiting - 1] if ranked else queue[at]) % _NO_CANDIDATE)
+        n_waiting, at = n_waiting - ranked, at + (not ranked)
+        i, j, p = int(found[k, 0]), int(found[k, 1]), int(found[k, 4])
         if seen[i, j]:
             continue
-        p = int(found[k, 4])
-        v, u, is_peak = _peak_pixel(image, planes, p, i, j, peak[p, i, j] >= clipped, int(clipped))
+        if not ranked:
+            v, u, rank = _brightest(image, planes, p, i, j)
+            found[k, 2], found[k, 3] = rank, v * image.shape[1] + u
+            if planes == 3 and peak[p, i, j] >= clipped:  # its place in the queue was the best that it could have
+                n_waiting = _insert(waiting, n_waiting, k - _NO_CANDIDATE * float(rank))
+                continue
+        rank, v, u = int(found[k, 2]), int(found[k, 3]) // image.shape[1], int(found[k, 3]) % image.shape[1]
+        v, u, is_peak = _peak_pixel(image, planes, p, v, u, rank, peak[p, i, j] >= clipped, int(clipped))
         if not is_peak or seen[v // tiles.TILE_PX, u // tiles.TILE_PX]:
             continue
         noise = max(scale * sigma[i // tiles.BLOCK, j // tiles.BLOCK], q[fields.MIN_NOISE])
@@ -145,31 +154,31 @@ def _most_outstanding(found: Array, count: int, most: int) -> int:
 
 
 @njit(error_model="numpy")
-def _brightest_first(image: Image, planes: int, peak: Image, clipped: int, found: Array, count: int) -> Indices:
-    """Order of the candidates by their tile's largest value; saturated ones by all channels of their brightest pixel.
+def _brightest_first(planes: int, peak: Image, clipped: int, found: Array, count: int) -> Array:
+    """The candidates by their tile's largest value, the brightest first: their number less `_NO_CANDIDATE` times that.
 
-    For these the other channels tell the core from its halo.
+    Saturated ones of three channels by the highest rank that their brightest pixel may have: it tells a core from its
+    halo.
     """
-    key = np.empty(count)
+    queue = np.empty(count)
     for k in range(count):
         i, j, p = int(found[k, 0]), int(found[k, 1]), int(found[k, 4])
-        key[k] = -1024.0 * peak[p, i, j]
+        rank = 1024.0 * peak[p, i, j]
         if planes == 3 and peak[p, i, j] >= clipped:
-            key[k] = -_highest_rank(image, p, i, j)
-    return np.argsort(key, kind="mergesort")
+            rank += float(peak[0, i, j]) + float(peak[1, i, j]) + float(peak[2, i, j])
+        queue[k] = k - _NO_CANDIDATE * rank
+    return np.sort(queue)
 
 
 @njit(error_model="numpy")
-def _highest_rank(image: Image, p: int, i: int, j: int) -> int:
-    """Rank of the brightest pixel of a tile of three channels."""
-    best, left = 0, j * tiles.TILE_PX
-    right = min(left + tiles.TILE_PX, image.shape[1])
-    for v in range(i * tiles.TILE_PX, min((i + 1) * tiles.TILE_PX, image.shape[0])):
-        line = image[v, left:right]
-        for u in range(len(line)):
-            rank = 1024 * int(line[u, p]) + int(line[u, 0]) + int(line[u, 1]) + int(line[u, 2])
-            best = max(best, rank)
-    return best
+def _insert(waiting: Array, count: int, value: float) -> int:
+    """Insert into the first `count` values, of which the smallest is the last; returns the new count."""
+    k = count
+    while k > 0 and waiting[k - 1] < value:
+        waiting[k] = waiting[k - 1]
+        k -= 1
+    waiting[k] = value
+    return count + 1
 
 
 @njit(error_model="numpy")
@@ -194,13 +203,12 @@ def _brightest(image: Image, planes: int, p: int, i: int, j: int) -> tuple[int, 
 
 @njit(error_model="numpy")
 def _peak_pixel(
-    image: Image, planes: int, p: int, i: int, j: int, saturated: bool, clipped: int
+    image: Image, planes: int, p: int, row: int, column: int, best: int, saturated: bool, clipped: int
 ) -> tuple[int, int, bool]:
-    """Row and column of a tile's brightest pixel of a map, on a plateau of its middle.
+    """Row and column of the middle of the plateau that a tile's brightest pixel of a map, of rank `best`, stands on.
 
     And whether it is a peak: none next to it, beyond the tile, is brighter.
     """
-    row, column, best = _brightest(image, planes, p, i, j)
     reach = 2 if planes == 4 else 1
     for v in range(max(row - reach, 0), min(row + reach + 1, image.shape[0])):
         for u in range(max(column - reach, 0), min(column + reach + 1, image.shape[1])):
@@ -212,8 +220,8 @@ def _peak_pixel(
         # noise in what is clipped in every channel would cut the run short, and a core be measured from its rim
         least, most = white, clipped
     for _ in range(2):
-        row = _middle_of_run(image, planes, p, row, column, 1, 0, least, most, farthest)
-        column = _middle_of_run(image, planes, p, row, column, 0, 1, least, most, farthest)
+        row = _middle_of_run(image, planes, p, row, column, _STEP, _STAY, least, most, farthest)
+        column = _middle_of_run(image, planes, p, row, column, _STAY, _STEP, least, most, farthest)
     return row, column, best > 0
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from lumidock._kernels import constant
 from lumidock._kernels.lens import inside
 from lumidock._kernels.pose import light_row, refine
 from lumidock.datatypes import Array, Indices
@@ -18,13 +19,6 @@ LOG_2PI = math.log(2.0 * math.pi)
 HUGE = 1e300
 _ELSEWHERE = 8.0  # log odds of two priors that one solution under both cannot reach
 _EDGE_PX, _SHINES = 3.0, 0.1  # a light this near the edge, or seen this flat (cosine), may be missing at no cost
-
-
-def constant(value: int) -> int:
-    """A number in numpy's type: numba compiles a function, and all below it, anew for every literal int it is given."""
-    return cast(int, np.int64(value))
-
-
 STEPS = constant(6)  # of Gauss-Newton, at most
 
 
@@ -66,7 +60,7 @@ class Naming(NamedTuple):
     t: Array
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def copied(one: Naming) -> Naming:
     """The same hypothesis in arrays of its own."""
     return Naming(one.name.copy(), one.R.copy(), one.t.copy())
@@ -87,7 +81,7 @@ def keep(e: float, best: float, one: Naming, better: Naming) -> float:
     return e
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def survey_var(lens: Array, R: Array, t: Array, p: Array, survey_m2: float) -> float:
     """Variance px^2 that the survey error of a light at `p` (3,) adds."""
     z = max(R[2, 0] * p[0] + R[2, 1] * p[1] + R[2, 2] * p[2] + t[2], 0.05)
@@ -143,7 +137,7 @@ def log_evidence(one: Naming, scene: Scene, info: Array, fitted: tuple[float, fl
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _shines(scene: Scene, R: Array, t: Array, c: int) -> bool:
     """Whether light `c` sends its light toward the camera, which stands at -R^T t."""
     norm, along = 0.0, 0.0
@@ -179,7 +173,7 @@ def solved(one: Naming, scene: Scene, info: Array, steps: int, H: Array, L: Arra
     return log_evidence(one, scene, info, fit(one, scene, info, steps, H, L))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def log_add(a: float, b: float) -> float:
     """Logarithm of the sum of two numbers from their logarithms."""
     high, low = max(a, b), min(a, b)
@@ -209,7 +203,7 @@ def named(name: Indices) -> int:
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def named_lights(name: Indices) -> Indices:
     """The lights (K,) that a naming names."""
     lights, n = np.empty(named(name), np.int64), 0
@@ -220,7 +214,7 @@ def named_lights(name: Indices) -> Indices:
     return lights
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def named_points(name: Indices, p: Array) -> Array:
     """Positions (K, 3) of the lights that a naming names."""
     lights = named_lights(name)
@@ -232,16 +226,35 @@ def named_points(name: Indices, p: Array) -> Array:
 
 @njit(cache=True, error_model="numpy")
 def weigh(
-    uv: Array, cov: Array, p_rear: Array, p_light: Array, is_rear: Indices, trust: float, like: Array, var: Array
+    uv: Array,
+    radius: Array,
+    p_rear: Array,
+    is_rear: Indices,
+    trust: float,
+    strange: tuple[float, float, float],
+    cov: Array,
+    p_light: Array,
+    like: Array,
+    var: Array,
 ) -> float:
-    """Fill `like` (N, L), softened log likelihood ratios, and `var` (N,) px^2 per axis; the area px^2 of all spots."""
+    """Fill `like` (N, L), softened log likelihood ratios, and `var` (N,) px^2 per axis; the area px^2 of all spots.
+
+    `p_light` (N,) becomes 1 where it is NaN. `cov` (N, 2, 2) grows by a `strange` share of the radius, or of its bound,
+    where `p_light` is less than this much.
+    """
     low_u, high_u, low_v, high_v = np.inf, -np.inf, np.inf, -np.inf
-    layers = len(is_rear)
+    layers, (share, most, usual) = len(is_rear), strange
     for i in range(len(uv)):
+        if math.isnan(p_light[i]):
+            p_light[i] = 1.0
+        own = radius[i] if radius[i] < most else most
+        wider = (share * max(1.0 - p_light[i] / usual, 0.0) * own) ** 2
+        cov[i, 0, 0] += wider
+        cov[i, 1, 1] += wider
         low_u, high_u = min(low_u, uv[i, 0]), max(high_u, uv[i, 0])
         low_v, high_v = min(low_v, uv[i, 1]), max(high_v, uv[i, 1])
         var[i] = 0.5 * (cov[i, 0, 0] + cov[i, 1, 1])
-        lamp = 0.0 if math.isnan(p_light[i]) else math.log(min(max(2.0 * p_light[i], 0.05), 1.0))
+        lamp = math.log(min(max(2.0 * p_light[i], 0.05), 1.0))
         p = 0.5 if math.isnan(p_rear[i]) or layers == 1 else 0.5 + trust * (p_rear[i] - 0.5)
         for k in range(layers):
             like[i, k] = lamp + math.log(2.0 * (p if is_rear[k] == 1 or layers == 1 else 1.0 - p))

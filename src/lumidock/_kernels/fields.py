@@ -16,7 +16,6 @@ from __future__ import annotations
     LEVEL,
     SATURATED,
     CUT,
-    HALO,
     CORE,
     P_LIGHT,
     VAR_UU,
@@ -24,8 +23,8 @@ from __future__ import annotations
     VAR_VU,
     VAR_VV,
     BY_LENS,
-) = range(18)
-COLUMNS = 18
+) = range(17)
+COLUMNS = 17
 # what may be tuned, see `DetectConfig`
 (
     CONTRAST,

@@ -47,13 +47,8 @@ def fit(
     ex, ey = np.empty(right - left), np.empty(bottom - top)
     z = np.empty((bottom - top, right - left))
     room = ((bottom - top + pitch - 1) // pitch) * ((right - left + pitch - 1) // pitch)
-    flat, used, g, a, b = (
-        np.empty((parts, room)),
-        np.empty((parts, room)),
-        np.empty(room),
-        np.empty(room),
-        np.empty(room),
-    )
+    samples, profile = np.empty((2, parts, room)), np.empty((3, room))
+    flat, used, g, a, b = samples[0], samples[1], profile[0], profile[1], profile[2]
     _read(image, planes, scale, weight, slope, left, top, u0, v0, clipped, z)
     for p in range(parts):
         _unroll(z[((p >> 1) - top) % pitch :: pitch, ((p & 1) - left) % pitch :: pitch], flat[p], used[p])
@@ -162,7 +157,10 @@ def _misfit(
     no such balance, and every residual counts.
     """
     (ex, ey), whole = profile, True
-    var, info, signal = np.empty(z.shape), np.empty(z.shape), np.empty(z.shape)
+    room, a = np.empty((3, z.shape[0], z.shape[1])), np.empty(z.shape[1])
+    var, info, signal = room[0], room[1], room[2]
+    for j in range(len(a)):
+        a[j] = ((j - center[0]) / s) ** 2
     for i in range(len(z)):
         b = ((i - center[1]) / s) ** 2
         for j in range(z.shape[1]):
@@ -170,10 +168,9 @@ def _misfit(
             g = amplitude[p] * ex[j] * ey[i]
             z[i, j] -= ground[p] + g
             var[i, j] = noise * noise + signal_noise * max(g, 0.0)
-            info[i, j] = g * g * (((j - center[0]) / s) ** 2 + b) / var[i, j]
+            info[i, j] = g * g * (a[j] + b) / var[i, j]
             whole &= not np.isnan(z[i, j])
             signal[i, j] = g
-    allowed = (_PROFILE * signal) ** 2 if whole else np.zeros(z.shape)
     middle_j, middle_i = int(np.floor(center[0] + 0.5)), int(np.floor(center[1] + 0.5))
     total, weight, square, least = 0.0, 0.0, 0.0, 0.0
     for i in range(len(z)):
@@ -181,10 +178,10 @@ def _misfit(
             k, m = 2 * middle_i - i, 2 * middle_j - j
             if whole and (not (i < k or (i == k and j < m)) or k >= len(z) or m < 0 or m >= z.shape[1]):
                 continue
-            odd, share, expected, profile_var = z[i, j], info[i, j], var[i, j], allowed[i, j]
+            odd, share, expected, profile_var = z[i, j], info[i, j], var[i, j], 0.0
             if whole:
                 odd, share, expected = odd - z[k, m], share + info[k, m], expected + var[k, m]
-                profile_var += allowed[k, m]
+                profile_var = (_PROFILE * signal[i, j]) ** 2 + (_PROFILE * signal[k, m]) ** 2
             if not np.isnan(odd):
                 total += share * odd * odd / (expected + profile_var)
                 least += share * profile_var / (expected + profile_var)

@@ -7,13 +7,13 @@ import math
 import numpy as np
 from numba import njit
 
+from lumidock._kernels import constant
 from lumidock._kernels.evidence import (
     GATE,
     HUGE,
     STEPS,
     Naming,
     Scene,
-    constant,
     copied,
     fit,
     keep,
@@ -58,7 +58,7 @@ def grow(allowed: int, one: Naming, taken: Indices, scene: Scene, least: int) ->
     return fitted
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def extend(one: Naming, taken: Indices, scene: Scene) -> float:
     """Extend a hypothesis of one layer to all, in place, over both poses of the plane and the first light beyond it.
 
@@ -91,7 +91,7 @@ def extend(one: Naming, taken: Indices, scene: Scene) -> float:
     return best
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _most_supported(
     out: Array, found: int, sight: Sight, taken: Indices, scene: Scene, gate: float, tops: Array
 ) -> int:

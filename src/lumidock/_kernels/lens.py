@@ -48,7 +48,7 @@ def project(lens: Array, x: float, y: float, z: float) -> Projection:
     return True, u * lens[1] + lens[3], v * lens[2] + lens[4], uu, uv, uz, vu, vv, vz
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _project_equidistant(lens: Array, x: float, y: float, z: float) -> Projection:
     r = math.sqrt(x * x + y * y)
     theta = math.atan2(r, z)
@@ -107,7 +107,7 @@ def factor(A: Array, n: int) -> float:
     return log_det
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def solve_factored(L: Array, n: int, b: Array) -> None:
     """Solve L L^T x = b in place for the leading (n, n) of the factor `L`."""
     for i in range(n):
@@ -122,7 +122,7 @@ def solve_factored(L: Array, n: int, b: Array) -> None:
         b[i] = s / L[i, i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def invert6(A: Array, L: Array, P: Array) -> float:
     """Inverse `P` (6, 6) of a symmetric `A` (6, 6), with `L` (6, 6) as work space; log det A, NaN if not positive."""
     for i in range(6):
@@ -149,7 +149,7 @@ def invert6(A: Array, L: Array, P: Array) -> float:
     return log_det
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def rotate_exp(R: Array, wx: float, wy: float, wz: float) -> None:
     """R <- R Exp(w) in place. Source: Sola eq. (135)."""
     angle = math.sqrt(wx * wx + wy * wy + wz * wz)

@@ -37,13 +37,13 @@ def outputs(R: Array, t: Array) -> Array:
     return C
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _largest2(a: float, b: float, c: float) -> float:
     """Largest eigenvalue of [[a, b], [b, c]]."""
     return 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _largest3(A: Array) -> float:
     """Largest eigenvalue of the symmetric rows and columns 3..5 of `A`, by the trigonometric formula."""
     m = (A[3, 3] + A[4, 4] + A[5, 5]) / 3.0

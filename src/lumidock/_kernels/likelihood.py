@@ -39,10 +39,9 @@ def dim_glints(spots: Array, n: int, q: Array) -> None:
     before = spots[:n, fields.P_LIGHT].copy()
     for k in range(n):
         for m in range(n):
-            near = (
-                np.hypot(spots[k, fields.U] - spots[m, fields.U], spots[k, fields.V] - spots[m, fields.V])
-                < q[fields.GLINT_RADII] * spots[m, fields.RADIUS]
-            )
+            du, dv = spots[k, fields.U] - spots[m, fields.U], spots[k, fields.V] - spots[m, fields.V]
+            reach = q[fields.GLINT_RADII] * spots[m, fields.RADIUS]
+            near = abs(du) < reach and abs(dv) < reach and np.hypot(du, dv) < reach
             weaker = (
                 spots[m, fields.FLUX] > q[fields.GLINT_RATIO] * spots[k, fields.FLUX]
                 and spots[m, fields.CORE] > 0.9 * spots[k, fields.CORE]

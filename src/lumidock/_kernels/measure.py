@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lumidock._kernels import fields, patch, peaks, samples, tiles
+from lumidock._kernels import constant, fields, patch, peaks, samples, tiles
 from lumidock._kernels.describe import FILTER_PX, describe, index, peak_value, small_snr
 from lumidock._kernels.patch import Window
 from lumidock.datatypes import Array, Image, Indices
@@ -13,6 +13,7 @@ from lumidock.datatypes import Array, Image, Indices
 LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out, until it is round and alone
 _MAX_TILES = 20  # a light is not wider
 _ROUNDS = 4
+_ONLY_MARK = constant(1)
 _QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth having clears 1.8
 # share of a peak's height that a lens that blurs by 0.65 px, 1 sigma, gives the pixels around it; on a mosaic those of
 # other colours get a quarter of it from a lamp of one colour
@@ -55,8 +56,8 @@ def measure(
         if not samples.stands_out(image, planes, scale, plane, v, u, ring, sigma, _QUICK, small):
             return -1
         samples.weigh(image, planes, scale, v, u, radius, weight)
-    shared = (weight**2 * shared_by_plane).sum() / (weight**2).sum()
-    expected = noise * np.sqrt((weight**2).sum())
+    shared = samples.mean_by_square(weight, shared_by_plane)
+    expected = noise * np.sqrt(samples.square(weight))
     reach = min(max(3.5 * radius, 1.5 * q[fields.RING_PX]), 3.5 * q[fields.MAX_RADIUS_PX])
     # of the surroundings: level, noise, texture that hides a spot, texture that moves it, how far noise is shared, and
     # the noise that shows
@@ -83,7 +84,7 @@ def measure(
         sums = window[3]
         if part == 0.0:
             if not clipped:
-                _own(seen, window[1], where, start)
+                _own(seen, window, where, start)
                 return 0
             if sums[patch.OPEN] == 0.0 or reach >= 3.5 * q[fields.MAX_RADIUS_PX]:
                 _own_plateau(image, planes, scale, weight, v, u, reach, q, window, where, start, seen)
@@ -97,8 +98,8 @@ def measure(
         reach = wanted
     if part == 0.0:
         return 0
-    _own(seen, window[1], where, start)
-    ground[4] = (weight**2 * shared_by_plane**2).sum() / (weight**2).sum()
+    _own(seen, window, where, start)
+    ground[4] = samples.mean_by_square(weight, shared_by_plane**2)
     if planes == 3:  # in the sum of channels fine noise is what JPEG leaves, and coarse noise that of the sensor
         ground[4] = min(max(ground[4] * (expected / ground[1]) ** 2, 1.0), _MOST_SHARED)
     spots[n, fields.CORE] = 0.0
@@ -164,6 +165,7 @@ def _level(
     first = 1 if planes == 1 and top >= q[fields.CLIPPED] else 0
     fallback = 0.0
     if top <= floor:
+        patch.take_all(window[3], where)
         return 0.0
     for k in range(first, len(LEVELS) + 1):
         again = k == len(LEVELS)
@@ -197,12 +199,12 @@ def _holds_another(stamp: Image, where: Array, mark: int, spots: Array, n: int) 
 
 
 @njit(error_model="numpy")
-def _own(seen: Image, stamp: Image, where: Array, start: Indices) -> None:
+def _own(seen: Image, window: Window, where: Array, start: Indices) -> None:
     """Mark the tiles that the grown region touches: nobody looks there again."""
-    mark, t = stamp[start[1], start[0]], tiles.TILE_PX
-    unit, columns = int(where[patch.UNIT]), int(where[patch.COLUMNS])
-    for y in range(int(where[patch.ROWS])):
-        line, x = stamp[y], 0
+    stamp, sums, t = window[1], window[3], tiles.TILE_PX
+    mark, unit, columns = stamp[start[1], start[0]], int(where[patch.UNIT]), int(sums[patch.LAST_COLUMN]) + 1
+    for y in range(int(sums[patch.FIRST_ROW]), int(sums[patch.LAST_ROW]) + 1):
+        line, x = stamp[y], int(sums[patch.FIRST_COLUMN])
         top = int(where[patch.TOP]) + y * unit
         last_row = min((top + unit - 1) // t + 1, seen.shape[0])
         while x < columns:
@@ -243,5 +245,5 @@ def _own_plateau(
     patch.cut(image, planes, scale, weight, v, u, reach, patch.COARSE_SIDE, window[0], where)
     start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
     window[1][:] = 0
-    patch.grow(window, where, image, start[0], start[1], LEVELS[-1] * least, q[fields.CLIPPED], 1)
-    _own(seen, window[1], where, start)
+    patch.grow(window, where, image, start[0], start[1], LEVELS[-1] * least, q[fields.CLIPPED], _ONLY_MARK)
+    _own(seen, window, where, start)

@@ -18,7 +18,8 @@ ROOM = SIDE + 16
 _ROOT_TWO = np.sqrt(2.0)
 _LEAST_ROWS = 4.0  # of a field
 # entries of `sums`, see `grow`; weights w are over the level
-N, X, Y, XX, XY, YY, W, WX, WY, CLIPPED, EDGE, OPEN = range(12)
+N, X, Y, XX, XY, YY, W, WX, WY, CLIPPED, EDGE, OPEN, FIRST_COLUMN, LAST_COLUMN, FIRST_ROW, LAST_ROW = range(16)
+SUMS = 16
 # the window's geometry, see `cut`
 LEFT, TOP, UNIT, COLUMNS, ROWS, SLOPE_U, SLOPE_V = range(7)
 Window = tuple[Array, NDArray[np.int16], NDArray[np.int32], Array]
@@ -48,28 +49,36 @@ def cut(
     rows = min((min(v + int(reach) + 1, image.shape[0]) - top) // unit, ROOM)
     where[0], where[1], where[2], where[3], where[4] = left, top, unit, max(columns, 1), max(rows, 1)
     n, m = int(where[COLUMNS]), int(where[ROWS])
-    if planes == 1:
-        for i in range(m):
-            line, out = image[top + i * unit, left:, 0], patch[i]
-            for j in range(n):
-                out[j] = scale * line[j * unit]
-    elif planes == 3:
-        w0, w1, w2 = scale * weight[0], scale * weight[1], scale * weight[2]
-        for i in range(m):
-            pixels, out = image[top + i * unit, left:], patch[i]
-            for j in range(n):
-                x = j * unit
-                out[j] = w0 * pixels[x, 0] + w1 * pixels[x, 1] + w2 * pixels[x, 2]
-    else:
-        last = image.shape[1] - 1 - left
-        w0, w1, w2, w3 = scale * weight[0], scale * weight[1], scale * weight[2], scale * weight[3]
-        for i in range(m):
-            y = top + i * unit
-            even, odd, out = image[y, left:, 0], image[min(y + 1, image.shape[0] - 1), left:, 0], patch[i]
-            for j in range(n):
-                x = j * unit
-                z = min(x + 1, last)
-                out[j] = w0 * even[x] + w1 * even[z] + w2 * odd[x] + w3 * odd[z]
+    samples, first = image.reshape(len(image), -1), left * image.shape[2]  # rows of which a loop can take many at once
+    w0, w1, w2, w3 = scale * weight[0], scale * weight[1], scale * weight[2], scale * weight[3]
+    last = image.shape[1] - 1 - left
+    for i in range(m):
+        y, out = top + i * unit, patch[i]
+        line = samples[y, first:]
+        if planes == 1:
+            if unit == 1:
+                for j in range(n):
+                    out[j] = scale * line[j]
+            else:
+                for j in range(n):
+                    out[j] = scale * line[j * unit]
+        elif planes == 3:
+            if unit == 1:
+                for j in range(n):
+                    out[j] = w0 * line[3 * j] + w1 * line[3 * j + 1] + w2 * line[3 * j + 2]
+            else:
+                for j in range(n):
+                    x = 3 * j * unit
+                    out[j] = w0 * line[x] + w1 * line[x + 1] + w2 * line[x + 2]
+        else:
+            odd = samples[min(y + 1, len(image) - 1), first:]
+            if unit == 2 and 2 * n - 1 <= last:
+                for j in range(n):
+                    out[j] = w0 * line[2 * j] + w1 * line[2 * j + 1] + w2 * odd[2 * j] + w3 * odd[2 * j + 1]
+            else:
+                for j in range(n):
+                    x, z = j * unit, min(j * unit + 1, last)
+                    out[j] = w0 * line[x] + w1 * line[z] + w2 * odd[x] + w3 * odd[z]
 
 
 @njit(error_model="numpy")
@@ -169,10 +178,14 @@ def filtered(patch: Array, where: Array, x: float, y: float, width: float, level
     """Amplitude of a Gaussian of `width` samples at a place, and how many samples' worth of averaging is in it."""
     reach = int(np.ceil(2.5 * width))
     total, power = 0.0, 1e-12
+    first, last = max(int(x) - reach, 0), min(int(x) + reach + 2, int(where[COLUMNS]))
+    across = np.empty(2 * reach + 2)
+    for j in range(first, last):
+        across[j - first] = np.exp(-0.5 * (j - x) ** 2 / (width * width))
     for i in range(max(int(y) - reach, 0), min(int(y) + reach + 2, int(where[ROWS]))):
         b = np.exp(-0.5 * (i - y) ** 2 / (width * width))
-        for j in range(max(int(x) - reach, 0), min(int(x) + reach + 2, int(where[COLUMNS]))):
-            window = b * np.exp(-0.5 * (j - x) ** 2 / (width * width))
+        for j in range(first, last):
+            window = b * across[j - first]
             total += window * (patch[i, j] - level)
             power += window * window
     return total / power, power
@@ -182,7 +195,8 @@ def filtered(patch: Array, where: Array, x: float, y: float, width: float, level
 def grow(window: Window, where: Array, image: Image, x: int, y: int, level: float, clipped: float, mark: int) -> None:
     """Sum up the connected samples over `level` around one, coordinates relative to it, into the window's sums.
 
-    `CLIPPED` counts saturated samples, `EDGE` those at the picture's edge, `OPEN` those at the window's.
+    `CLIPPED` counts saturated samples, `EDGE` those at the picture's edge, `OPEN` those at the window's. The first and
+    last column and row are the window's.
     """
     patch, stamp, stack, sums = window
     columns, rows = int(where[COLUMNS]), int(where[ROWS])
@@ -190,6 +204,7 @@ def grow(window: Window, where: Array, image: Image, x: int, y: int, level: floa
     at_right = where[LEFT] + where[UNIT] * columns >= image.shape[1] - 1
     at_bottom = where[TOP] + where[UNIT] * rows >= image.shape[0] - 1
     sums[:] = 0.0
+    left, right, upper, lower = x, x, y, y
     stack[0, 0], stack[0, 1] = x, y
     stamp[y, x] = 0
     top = 1
@@ -204,6 +219,7 @@ def grow(window: Window, where: Array, image: Image, x: int, y: int, level: floa
             first -= 1
         while last < columns and line[last] > level:
             last += 1
+        left, right, upper, lower = min(left, first), max(right, last - 1), min(upper, i), max(lower, i)
         _add_run(line[first:last], float(first - x), float(i - y), level, clipped, sums)
         mine[first:last] = mark
         if i == 0 or i == rows - 1:
@@ -221,6 +237,13 @@ def grow(window: Window, where: Array, image: Image, x: int, y: int, level: floa
                         top += 1
                     if new == last - first:  # all of it is one run
                         break
+    sums[FIRST_COLUMN], sums[LAST_COLUMN], sums[FIRST_ROW], sums[LAST_ROW] = left, right, upper, lower
+
+
+@njit(error_model="numpy")
+def take_all(sums: Array, where: Array) -> None:
+    """Of a region that is a whole window, its columns and rows."""
+    sums[FIRST_COLUMN], sums[LAST_COLUMN], sums[FIRST_ROW], sums[LAST_ROW] = 0, where[COLUMNS] - 1, 0, where[ROWS] - 1
 
 
 @njit(error_model="numpy")
@@ -266,15 +289,18 @@ def soften(window: Window, where: Array, start: Indices, level: float, lower: fl
     columns, rows, mark = int(where[COLUMNS]), int(where[ROWS]), stamp[start[1], start[0]]
     for k, of in ((W, N), (WX, X), (WY, Y)):
         sums[k] += (level - lower) * sums[of]
+    left, right = max(int(sums[FIRST_COLUMN]) - 1, 0), min(int(sums[LAST_COLUMN]) + 1, columns - 1)
+    upper, down = max(int(sums[FIRST_ROW]) - 1, 0), min(int(sums[LAST_ROW]) + 1, rows - 1)
     count = 0
-    for i in range(rows):
+    for i in range(upper, down + 1):
         line, mine = patch[i], stamp[i]
-        for j in range(columns):
+        for j in range(left, right + 1):
             if line[j] <= lower or mine[j] == mark:
                 continue
             if _is_beside(stamp, i, j, rows, columns, mark):
                 rim[count, 0], rim[count, 1] = j, i
                 count += 1
+    sums[FIRST_COLUMN], sums[LAST_COLUMN], sums[FIRST_ROW], sums[LAST_ROW] = left, right, upper, down
     for k in range(count):
         j, i = rim[k]
         _add_run(patch[i, j : j + 1], float(j - start[0]), float(i - start[1]), lower, np.inf, sums)
@@ -297,13 +323,13 @@ def fields_apart(window: Window, where: Array, start: Indices, level: float) -> 
 
     Of the region grown last, around `start`; nothing where rows are left out, or a field has too few.
     """
-    patch, stamp, mark = window[0], window[1], window[1][start[1], start[0]]
+    patch, stamp, mark, sums = window[0], window[1], window[1][start[1], start[0]], window[3]
     if where[UNIT] > 1.0:
         return 0.0, 0.0
     total, rows = np.zeros((2, 3)), np.zeros(2)
-    for i in range(int(where[ROWS])):
+    for i in range(int(sums[FIRST_ROW]), int(sums[LAST_ROW]) + 1):
         k, before = i & 1, total[i & 1, 0]
-        for j in range(int(where[COLUMNS])):
+        for j in range(int(sums[FIRST_COLUMN]), int(sums[LAST_COLUMN]) + 1):
             if stamp[i, j] == mark:
                 w = patch[i, j] - level
                 total[k, 0] += w

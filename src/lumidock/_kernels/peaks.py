@@ -8,6 +8,7 @@ from numba import njit
 from lumidock._kernels.tiles import BLOCK
 from lumidock.datatypes import Array, Image, Indices
 
+_NEARLY = 1.0 - 1e-9  # of a margin that rounding may not raise
 _FAR = 4  # tiles at which the slopes of a wide light show
 _HALO = 40.0  # sigmas over the background that only the halo of something bright reaches beside its peak
 
@@ -35,7 +36,9 @@ def candidates(
     (Q, h, w) is left to those at the region's rim; so are tiles that are `seen` (h, w), and the others become it.
     Returns how many there are.
     """
-    count, least, worth = 0, np.empty(peak.shape[1], peak.dtype), np.empty(peak.shape[1], np.uint8)
+    n, count, least = rect[3] - rect[2], 0, np.empty(peak.shape[1], peak.dtype)
+    worth = np.zeros((n + 7) // 8 * 8, np.uint8)
+    eight = worth.view(np.uint64)  # most are 0
     for i in range(rect[0], rect[1]):
         b = i // BLOCK
         if i == rect[0] or i % BLOCK == 0:
@@ -45,26 +48,31 @@ def candidates(
                     least[j] = value
         if not _worth_a_look(peak, i, least, rect[2], rect[3], worth):
             continue
-        for j in range(rect[2], rect[3]):
-            if not worth[j] or seen[i, j] or count == len(found):
+        for part in range(len(eight)):
+            if not eight[part]:
                 continue
-            here, over = spread * sigma[b, j // BLOCK], peak[i, j] - level[b, j // BLOCK]
-            local = np.sqrt(here * here + shot * max(over - _HALO * here, 0.0))
-            if not _stands_out(peak, i, j, max(int(1.5 * contrast * local), 2), int(clipped)):
-                continue
-            if peak[i, j] >= clipped and _is_inner(together, i, j, int(clipped)):
-                continue
-            seen[i, j] = 1
-            found[count, 0], found[count, 1] = i, j
-            found[count, 2] = over / here
-            count += 1
+            for j in range(rect[2] + 8 * part, min(rect[2] + 8 * part + 8, rect[3])):
+                if not worth[j - rect[2]] or seen[i, j] or count == len(found):
+                    continue
+                here, over = spread * sigma[b, j // BLOCK], peak[i, j] - level[b, j // BLOCK]
+                if not _rises(peak, i, j, max(int(_NEARLY * 1.5 * contrast * here), 2), int(clipped)):
+                    continue
+                local = np.sqrt(here * here + shot * max(over - _HALO * here, 0.0))
+                if not _stands_out(peak, i, j, max(int(1.5 * contrast * local), 2), int(clipped)):
+                    continue
+                if peak[i, j] >= clipped and _is_inner(together, i, j, int(clipped)):
+                    continue
+                seen[i, j] = 1
+                found[count, 0], found[count, 1] = i, j
+                found[count, 2] = over / here
+                count += 1
     return count
 
 
 @njit(error_model="numpy")
 def _worth_a_look(peak: Image, i: int, least: Image, first: int, last: int, worth: Image) -> bool:
     """Mark the tiles of a part of a row that reach the `least` value and stand on no slope; whether any reach it."""
-    here, limit, mark = peak[i, first:last], least[first:last], worth[first:last]
+    here, limit, mark = peak[i, first:last], least[first:last], worth[: last - first]
     total = 0
     for x in range(len(here)):
         mark[x] = here[x] >= limit[x]
@@ -82,25 +90,28 @@ def _worth_a_look(peak: Image, i: int, least: Image, first: int, last: int, wort
 
 @njit(error_model="numpy")
 def _stands_out(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
-    """Whether a tile is neither on a slope nor on a halo, see `candidates`: along the row first, which settles most."""
-    w = peak.shape[1]
-    twice = 2 * int(peak[i, j])
-    near = twice - int(peak[i, max(j - 1, 0)]) - int(peak[i, min(j + 1, w - 1)])
-    if near < 0:
+    """Whether a tile is neither on a slope nor on a halo, see `candidates`."""
+    if not _rises(peak, i, j, margin, clipped):
         return False
-    if twice < 2 * clipped and near < margin:
-        far = twice - int(peak[i, max(j - _FAR, 0)]) - int(peak[i, min(j + _FAR, w - 1)])
-        if far < margin:
-            return False
     near = over_pairs(peak, i, j, 1)
     if near < 0:
         return False
-    if twice >= 2 * clipped or near >= margin:
+    if peak[i, j] >= clipped or near >= margin:
         return True
     for d in range(2, _FAR):  # the top of a wide light, and not every bump on its flanks
         if over_pairs(peak, i, j, d) < 0:
             return False
     return over_pairs(peak, i, j, _FAR) >= margin
+
+
+@njit(error_model="numpy")
+def _rises(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
+    """Whether a tile stands out along its row, next to it or a few tiles away: it settles most."""
+    w, twice = peak.shape[1], 2 * int(peak[i, j])
+    near = twice - int(peak[i, max(j - 1, 0)]) - int(peak[i, min(j + 1, w - 1)])
+    if near < 0 or near >= margin or twice >= 2 * clipped:
+        return near >= 0
+    return twice - int(peak[i, max(j - _FAR, 0)]) - int(peak[i, min(j + _FAR, w - 1)]) >= margin
 
 
 @njit(error_model="numpy")

@@ -18,7 +18,7 @@ SAME_TURN = 2e-3  # rad; closer solutions are one
 _MAX_TURN = 0.5  # rad of one step
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def attitude_error(R: Array, Rp: Array, e: Array, J: Array) -> None:
     """Tilt and roll error `e` (3,) rad against the prior, and `J` (3, 3) for a right perturbation of T_cam_dock.
 
@@ -45,7 +45,7 @@ def attitude_error(R: Array, Rp: Array, e: Array, J: Array) -> None:
         J[2, k] = (cosine * ds - sine * dc) / norm
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _add_prior(R: Array, Rp: Array, info: Array, H: Array, g: Array) -> float:
     e, J = np.empty(3), np.empty((3, 3))
     attitude_error(R, Rp, e, J)
@@ -59,7 +59,7 @@ def _add_prior(R: Array, Rp: Array, info: Array, H: Array, g: Array) -> float:
     return cost
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def light_row(lens: Array, R: Array, t: Array, p: Array, h: Array) -> bool:
     """Pixel and pose Jacobian of the light at `p` (3,), into `h` (14,): u, v, then the two rows of 6; False if unseen.
 
@@ -81,7 +81,7 @@ def light_row(lens: Array, R: Array, t: Array, p: Array, h: Array) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def normal_equations(
     lens: Array, p: Array, uv: Array, var: Array, R: Array, t: Array, Rp: Array, info: Array, H: Array, g: Array
 ) -> float:
@@ -103,7 +103,7 @@ def normal_equations(
     return cost
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def refine(
     lens: Array,
     p: Array,
@@ -156,7 +156,7 @@ def refine(
     return cost, factor(L, 6)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _move(R: Array, t: Array, step: Array) -> None:
     """T <- T Exp(step) to first order in the translation; long turns are cut short."""
     turn = math.sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5])
@@ -216,7 +216,7 @@ def flip(p: Array, R: Array, t: Array) -> float:
     return math.sqrt(max(thickness, 0.0))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _least_axis(A: Array) -> Array:
     """Unit eigenvector (3,) of the smallest eigenvalue of a symmetric `A` (3, 3), by inverse iteration."""
     L = np.empty((3, 3))

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
+from lumidock._kernels import constant
 from lumidock._kernels.evidence import (
     GATE,
     HUGE,
@@ -14,7 +15,6 @@ from lumidock._kernels.evidence import (
     STEPS,
     Naming,
     Scene,
-    constant,
     copied,
     evidence,
     innovation,
@@ -61,7 +61,7 @@ def other_pose(one: Naming, scene: Scene, level: bool, other: Naming) -> float:
     return log_add(wide, narrow) if turn(one.R, held.R) > turn(other.R, held.R) else wide
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _levelled(p: Array, Rp: Array, R: Array, t: Array) -> None:
     """Turn a pose, in place, to the expected attitude with its own roll, about the centre of lights `p` (N, 3)."""
     sine, cosine = 0.0, 0.0
@@ -112,7 +112,7 @@ def rivals(one: Naming, taken: Indices, scene: Scene, without: Array, against: A
     return best
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _regrown(c: int, less: Naming, taken: Indices, scene: Scene, against: Array, best: float, better: Naming) -> float:
     """Without the name of light `c` others may find their place."""
     grown, H, L = copied(less), np.empty((6, 6)), np.empty((6, 6))
@@ -124,7 +124,7 @@ def _regrown(c: int, less: Naming, taken: Indices, scene: Scene, against: Array,
     return keep(e, best, grown, better)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _exchanged(
     c: int,
     name: Indices,

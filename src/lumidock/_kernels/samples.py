@@ -55,6 +55,20 @@ def ring_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int, r
 
 
 @njit(error_model="numpy")
+def _ring_is_over(image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float, limit: float) -> bool:
+    """Whether the samples of `ring_mean` say without sorting that it is over a limit: all but a quarter of them are."""
+    low, count = 0, 0
+    for k in range(0, RING, 2):
+        x, y = int(u + radius * COS[k] + 0.5), int(v + radius * SIN[k] + 0.5)
+        if 0 <= x < image.shape[1] and 0 <= y < image.shape[0]:
+            low += scale * sample(image, planes, p, y, x) <= limit
+            count += 1
+        if low > RING // 8:
+            return False
+    return low <= count // 4 and count > 0
+
+
+@njit(error_model="numpy")
 def log_lens_over_bad_pixel(
     image: Image, planes: int, scale: float, v: int, u: int, radius: float, share: float, noise: float
 ) -> float:
@@ -155,11 +169,17 @@ def weigh_clipped(
     radii, most = np.full(4, np.inf), largest
     for p in range(planes - 1, -1, -1):
         top, radius = core_mean(image, planes, scale, p, v, u), 3.0
+        if top < least:
+            continue
         while radius < most:
-            here = ring_mean(image, planes, scale, p, v, u, radius)
-            if here <= top - 0.5 * least:  # else it is over half height whatever the background
+            # else it is over half height whatever the background, or the background is too bright
+            if not (
+                _ring_is_over(image, planes, scale, p, v, u, radius, top - 0.5 * least)
+                or _ring_is_over(image, planes, scale, p, v, u, 3.0 * radius, top - least)
+            ):
+                here = ring_mean(image, planes, scale, p, v, u, radius)
                 dark = ring_mean(image, planes, scale, p, v, u, 3.0 * radius)
-                if top - dark >= least and here <= 0.5 * (top + dark):
+                if here <= top - 0.5 * least and top - dark >= least and here <= 0.5 * (top + dark):
                     radii[p], most = radius, min(1.3 * radius + 1e-6, most)
                     break
             radius *= 1.25
@@ -170,6 +190,24 @@ def weigh_clipped(
         weight[p] = 1.0 if radii[p] <= 1.3 * smallest else 0.0
     weight /= weight.sum()
     return float(smallest)
+
+
+@njit(error_model="numpy")
+def square(weight: Array) -> float:
+    """Sum of the squares of the planes' weights (4,)."""
+    total = 0.0
+    for p in range(4):
+        total += weight[p] * weight[p]
+    return total
+
+
+@njit(error_model="numpy")
+def mean_by_square(weight: Array, values: Array) -> float:
+    """Mean of the planes' `values` (4,) by the squares of their weights."""
+    total = 0.0
+    for p in range(4):
+        total += weight[p] * weight[p] * values[p]
+    return total / square(weight)
 
 
 @njit(error_model="numpy")

@@ -26,7 +26,7 @@ def assign(cost: Array) -> Indices:
     return _assign_rows(cost)
 
 
-@njit(cache=True)
+@njit()
 def _assign_rows(cost: Array) -> Indices:
     """`assign` for N <= M. Row and column 0 of the work arrays are sentinels."""
     n, m = cost.shape
@@ -88,7 +88,7 @@ def registration_cost(x: Array, seen: Array, lights: Array, previous: Array, w1:
     return cost
 
 
-@njit(cache=True)
+@njit()
 def _fitness(
     x: Array,
     seen: Array,
@@ -115,7 +115,7 @@ def _fitness(
     return total
 
 
-@njit(cache=True)
+@njit()
 def _under_explored(best_at: Array, low: Array, high: Array, rng: np.random.Generator) -> Array:
     """The one of eight random places that lies farthest from every particle's best so far."""
     farthest, place = -1.0, low.copy()

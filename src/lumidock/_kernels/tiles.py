@@ -11,10 +11,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lumidock._kernels import fields
+from lumidock._kernels import constant, fields
 from lumidock.datatypes import Array, Image, Indices
 
 TILE_PX, BLOCK = 8, 8  # pixels a side of a tile, tiles a side of a block
+EVERY = constant(1)  # step of rows
 SPARSE = 4  # one block in so many says how samples share their noise
 _SIGMA = 0.5117  # of the mean absolute second difference of normal noise: sqrt(pi / 12)
 
@@ -71,7 +72,7 @@ def refresh(rows: Image, planes: int, rect: Indices, step: int, peak: Image, lin
         if step == 1:
             _max_of_eight(rows, top, left, even[:n])
         else:
-            _max_of_four(rows, top, 0, 1, left, even[:n])
+            _max_of_four(rows, top, 0, EVERY, left, even[:n])
         if channels == 1:
             _largest_of_tiles(even, peak[0, i, rect[2] : rect[3]])
         else:

@@ -87,7 +87,7 @@ def predict(R: Array, t: Array, twist: Array, P: Array, dt: float, q_lin: float,
         P[TWIST + k, TWIST + k] += (q_lin if k < 3 else q_ang) * dt
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _adjoint(R: Array, t: Array) -> Array:
     """Adjoint (6, 6) of T_dock_cam from `R`, `t` of T_cam_dock."""
     A = np.zeros((6, 6))
@@ -143,7 +143,7 @@ def apply(R: Array, t: Array, x: Array, dx: Array) -> None:
         x[i] += dx[i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def difference(R0: Array, t0: Array, R: Array, t: Array, dx: Array) -> None:
     """The first six of `dx` that `apply` takes from one pose to the other."""
     D, move = np.empty((3, 3)), np.empty(3)
@@ -185,7 +185,7 @@ def row(lens: Array, state: State, p: Array, c: int, at: Array, h: Array, cal: A
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def gains(P: Array, h: Array, cal: Array, c: int, gu: Array, gv: Array) -> None:
     """P H^T of both rows of light `c`, (n,) each."""
     n = len(P)
@@ -205,7 +205,7 @@ def gains(P: Array, h: Array, cal: Array, c: int, gu: Array, gv: Array) -> None:
             gv[i] += b * P[base + k, i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def dot_row(g: Array, h: Array, cal: Array, axis: int, c: int) -> float:
     """H g for the row of u (`axis` 0) or v (1) of light `c`, as `row` has it."""
     base, o = LIGHTS + 3 * c, 2 + 6 * axis
@@ -251,6 +251,20 @@ def look(lens: Array, state: State, p: Array, axis: Array, out: Foreseen) -> Non
 
 
 @njit(cache=True, error_model="numpy")
+def windows(foreseen: Foreseen, margin_px: float, most_px: float, out: Array) -> int:
+    """Write u, v and reach px, four sigmas and a margin, of each light in sight to `out` (M, 3); how many there are."""
+    expected, S, shown = foreseen
+    count = 0
+    for c in range(len(shown)):
+        u, v, a, b = expected[c, 0], expected[c, 1], S[2 * c, 2 * c], S[2 * c + 1, 2 * c + 1]
+        if shown[c] > 0.0 and math.isfinite(u) and math.isfinite(v) and not (math.isnan(a) or math.isnan(b)):
+            reach = 4.0 * math.sqrt(max(a, b, 0.0)) + margin_px
+            out[count, 0], out[count, 1], out[count, 2] = u, v, min(reach, most_px)
+            count += 1
+    return count
+
+
+@njit(error_model="numpy")
 def _shines(state: State, p: Array, axis: Array, c: int) -> bool:
     """Whether light `c` sends its light toward the camera."""
     R, t, x = state.R, state.t, state.x

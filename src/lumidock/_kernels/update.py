@@ -112,7 +112,7 @@ def take_in(
     return square
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _whiten(lens: Array, p: Array, state: State, pixels: Pixels, rows: _Rows) -> bool:
     """Fill all of `rows` but its lights at a state; False where a light is out of the lens's sight."""
     lights, h, cal, Z, G = rows
@@ -132,17 +132,21 @@ def _whiten(lens: Array, p: Array, state: State, pixels: Pixels, rows: _Rows) ->
     if math.isnan(factor(Z, 2 * m)):
         return False
     for r in range(2 * m):
-        for k in range(r):
-            z = Z[r, k]
+        for k in range(0, r - 1, 2):
+            y, z = Z[r, k], Z[r, k + 1]
             for j in range(n):
-                G[r, j] -= z * G[k, j]
+                G[r, j] = G[r, j] - y * G[k, j] - z * G[k + 1, j]
+        if r % 2:
+            z = Z[r, r - 1]
+            for j in range(n):
+                G[r, j] -= z * G[r - 1, j]
         z = 1.0 / Z[r, r]
         for j in range(n):
             G[r, j] *= z
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _see(lens: Array, p: Array, state: State, rows: _Rows) -> bool:
     """Put the pixels of another state into `rows`, whose Jacobians stay; False where a light is out of sight."""
     at, h, cal = np.empty(3), np.empty(14), np.empty(2)
@@ -153,7 +157,7 @@ def _see(lens: Array, p: Array, state: State, rows: _Rows) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _innovate(pixels: Pixels, dx: Array, rows: _Rows, nu: Array) -> None:
     """Innovation `nu` (2 m,) against the prediction, from which the state is `dx` (n,) away."""
     for k in range(len(rows.lights)):
@@ -163,7 +167,7 @@ def _innovate(pixels: Pixels, dx: Array, rows: _Rows, nu: Array) -> None:
         nu[2 * k + 1] = pixels.uv[i, 1] - h[1] + dot_row(dx, h, cal, 1, c)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _forward(Z: Array, nu: Array, w: Array) -> None:
     """Solve Z w = nu for a lower triangle."""
     for r in range(len(nu)):
@@ -173,19 +177,20 @@ def _forward(Z: Array, nu: Array, w: Array) -> None:
         w[r] = s / Z[r, r]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _shrink(P: Array, G: Array, estimated: int) -> None:
-    """Take the information of an update out of `P` (n, n), but not from what is only considered."""
-    n = len(P)
-    for r in range(len(G)):
-        for i in range(n):
-            g = G[r, i]
-            end = n if i < estimated else estimated
+    """Take the information of an update out of `P` (n, n), but not from what is only considered; `G` (2 m, n)."""
+    for i in range(len(P)):
+        end = i + 1 if i < estimated else estimated
+        for r in range(0, len(G), 2):
+            u, v = G[r, i], G[r + 1, i]
             for j in range(end):
-                P[i, j] -= g * G[r, j]
+                P[i, j] = P[i, j] - u * G[r, j] - v * G[r + 1, j]
+        for j in range(end):
+            P[j, i] = P[i, j]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
     """One-fault solution separation: what leaving each light out of the update would do to the outputs `C`.
 
@@ -194,16 +199,20 @@ def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
     G^T V (V^T V)^-1 V^T G: block elimination, exact also where states are only considered.
     """
     lights, Z, G, m = rows.lights, rows.Z, rows.G, len(rows.lights)
-    V, U = np.empty((2 * m, 2)), np.empty((9, 2))
+    V, U, Y = np.empty((2 * m, 2)), np.empty((9, 2)), np.empty((2, 6))
     apart[:] = 0.0
     for k in range(m):
         a = b = d = wu = wv = 0.0
+        Y[:] = 0.0
         for r in range(2 * k, 2 * m):
-            for o in range(2):
-                s = 1.0 if r == 2 * k + o else 0.0
-                for q in range(2 * k, r):
-                    s -= Z[r, q] * V[q, o]
-                V[r, o] = s / Z[r, r]
+            su, sv = 1.0 if r == 2 * k else 0.0, 1.0 if r == 2 * k + 1 else 0.0
+            for q in range(2 * k, r):
+                su -= Z[r, q] * V[q, 0]
+                sv -= Z[r, q] * V[q, 1]
+            V[r, 0], V[r, 1] = su / Z[r, r], sv / Z[r, r]
+            for o in range(6):
+                Y[0, o] += G[r, o] * V[r, 0]
+                Y[1, o] += G[r, o] * V[r, 1]
             a += V[r, 0] * V[r, 0]
             b += V[r, 0] * V[r, 1]
             d += V[r, 1] * V[r, 1]
@@ -213,12 +222,8 @@ def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
         for j in range(9):
             U[j, 0] = U[j, 1] = 0.0
             for o in range(6):
-                gu = gv = 0.0
-                for r in range(2 * k, 2 * m):
-                    gu += G[r, o] * V[r, 0]
-                    gv += G[r, o] * V[r, 1]
-                U[j, 0] += C[j, o] * gu
-                U[j, 1] += C[j, o] * gv
+                U[j, 0] += C[j, o] * Y[0, o]
+                U[j, 1] += C[j, o] * Y[1, o]
         c = lights[k]
         for j in range(9):
             u, v = (d * U[j, 0] - b * U[j, 1]) / det, (a * U[j, 1] - b * U[j, 0]) / det

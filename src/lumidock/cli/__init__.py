@@ -305,13 +305,14 @@ def _seeds(text: str) -> tuple[int, int]:
 def _warm() -> None:
     """Compile ahead, so that no run waits for it."""
     from lumidock.localizer import Localizer
-    from lumidock.warm import warm_up
+    from lumidock.warm import compile_ahead, warm_up
 
     dock = load_station(shipped_or_path("station", DEFAULT_STATION))
     lens = load_camera(shipped_or_path("camera", DEFAULT_CAMERA))
-    print("compiling ...", flush=True)
+    print("compiling detection and matching, a minute or two ...", flush=True)
+    compile_ahead(dock, lens)
     for name, _ in warm_up(Localizer(dock, lens).process, dock, lens):
-        print(f"compiled for {name}", flush=True)
+        print(f"ready for {name}", flush=True)
     print("kept in numba's cache")
 
 
