@@ -55,6 +55,7 @@ def describe(
         return False
     spot[fields.LEVEL] = share
     radius, noise = spot[fields.RADIUS], ground[1]
+    halo = _around(window[0], where, start, sums, ground[0]) / (top - ground[0])
     merged = _unresolved(sums, q, where[patch.UNIT])
     slope = (where[patch.SLOPE_U], where[patch.SLOPE_V]) if planes < 4 else (0.0, 0.0)
     if where[patch.UNIT] > (2.0 if planes == 4 else 1.0):  # again, as finely as the room allows
@@ -85,7 +86,7 @@ def describe(
     # the higher region is a part of the lower one, so that half of their noise is common
     skewed = _disagreement(skew_u, skew_v, 0.5 * unit * unit * (cov[0] + cov[2] + 2.0 * _GRID**2))
     # half of it along the skew, half of it any way: a grid skews a spot one way and displaces it another
-    haze = _HAZE * min(max(spot[fields.HALO], 0.0), 1.0) * min(radius / _HAZE_PX, 1.0)
+    haze = _HAZE * min(max(halo, 0.0), 1.0) * min(radius / _HAZE_PX, 1.0)
     astray = 0.25 * (skewed[0] + skewed[2]) + (on_grid * unit) ** 2 * unit / radius + haze**2
     cov[0], cov[1], cov[2] = (
         unit * unit * cov[0] + 0.5 * skewed[0] + astray,
@@ -187,6 +188,20 @@ def peak_value(part: Array, where: Array, start: Indices) -> float:
                 at_x, at_y = x, y
     start[0], start[1] = at_x, at_y
     return best
+
+
+@njit(error_model="numpy")
+def _around(part: Array, where: Array, start: Indices, sums: Array, floor: float) -> float:
+    """Mean level over the floor on a circle around a region's centre, of twice its radius."""
+    radius = 2.0 * np.sqrt(sums[patch.N] / np.pi) + 1.0
+    x, y = start[0] + sums[patch.X] / sums[patch.N], start[1] + sums[patch.Y] / sums[patch.N]
+    total, count = 0.0, 0
+    for k in range(12):
+        a, b = int(x + radius * samples.COS[2 * k] + 0.5), int(y + radius * samples.SIN[2 * k] + 0.5)
+        if 0 <= a < where[patch.COLUMNS] and 0 <= b < where[patch.ROWS]:
+            total += part[b, a] - floor
+            count += 1
+    return total / max(count, 1)
 
 
 @njit(error_model="numpy")
