@@ -257,6 +257,14 @@ def test_an_existing_file_is_kept_unless_forced(lumidock, run, tmp_path):
     assert lumidock("export", run, tmp_path / "a.parquet", "--force")[0] == 0
 
 
+def test_a_file_is_replaced_by_a_whole_one_only(lumidock, run, tmp_path):
+    simulate(tmp_path / "other", "path.end_z_m=3.0")
+    (tmp_path / "a.mcap").write_text("mine")
+    assert lumidock("export", run, tmp_path / "a.mcap", "--source", tmp_path / "other", "--force")[0] == 2
+    assert (tmp_path / "a.mcap").read_text() == "mine"
+    assert {path.name for path in tmp_path.iterdir()} == {"a.mcap", "other"}
+
+
 @pytest.mark.parametrize(
     ("change", "match"),
     [

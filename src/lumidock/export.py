@@ -34,23 +34,30 @@ def export(
     """
     if target.suffix not in KINDS:
         raise InputError(f"{target}: not one of {', '.join(KINDS)}")
-    if target.suffix == ".parquet":
-        with extra("parquet"):
-            from lumidock.streams.parquet import write_parquet
-        return write_parquet(run, target)
     if target.suffix == ".mp4" and source is None:
         raise InputError(f"{target}: a video needs the pictures; give --source")
-    scene = Scene(load_station(run / "station.yaml"), load_camera(run / "camera.yaml"), vehicle)
-    sink, done = open_file_sink(target, scene), 0
+    begun = target.with_name(f".{target.stem}.begun{target.suffix}")  # a file that is there stays until all is written
     try:
-        with closing(sink):
-            for item, fix, latency_us in _frames(run, scene, source):
-                sink.add(item, fix, latency_us)
-                done += 1
-                progress(done, source.count if source else None)
-    except InputError:
-        target.unlink(missing_ok=True)  # what was begun is of no use
-        raise
+        done = _write(run, begun, source, vehicle, progress)
+        begun.replace(target)
+    finally:
+        begun.unlink(missing_ok=True)
+    return done
+
+
+def _write(
+    run: Path, path: Path, source: Source | None, vehicle: Vehicle | None, progress: Callable[[int, int | None], None]
+) -> int:
+    if path.suffix == ".parquet":
+        with extra("parquet"):
+            from lumidock.streams.parquet import write_parquet
+        return write_parquet(run, path)
+    scene, done = Scene(load_station(run / "station.yaml"), load_camera(run / "camera.yaml"), vehicle), 0
+    with closing(open_file_sink(path, scene)) as sink:
+        for item, fix, latency_us in _frames(run, scene, source):
+            sink.add(item, fix, latency_us)
+            done += 1
+            progress(done, source.count if source else None)
     return done
 
 
