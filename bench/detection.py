@@ -18,7 +18,7 @@ from lumidock.sim.scenario import shipped_scenarios
 from lumidock.streams.sources import open_source
 
 _SCENARIOS = ("approach", "water-1c", "shallow", "headlamp", "fouling", "pool", "snow")
-_SEED, _INTERVAL_S = 7001, 0.75
+_SEED, _INTERVAL_S = 7511, 0.75
 _NEAR_PX, _SAME_PX = 2.5, 6.0
 _SNRS = (8.0, 12.0, 50.0)
 _FEW = 10  # lights of a kind that say too little

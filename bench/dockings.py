@@ -107,4 +107,4 @@ def _row(name: str, runs: list[dict[str, Any]]) -> str:
         [f"{run['range_mean_mm']:.1f} / {run['range_95_mm']:.1f}" for run in runs],
         *([str(run[key]) for run in runs] for key in ("wrong", "valid", "hazardous")),
     ]
-    return f"| {name} | " + " | ".join("; ".join(cell) for cell in cells) + " |"
+    return f"| {name} | " + " | ".join("; ".join(cell) for cell in cells).replace("nan / nan", "-") + " |"
