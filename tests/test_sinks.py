@@ -237,6 +237,8 @@ REFUSED = {
     "another source": (("fixes.mcap", "--source", "other"), "not what"),
     "no pictures": (("fixes.mp4",), "give --source"),
     "unknown ending": (("fixes.doc",), "not one of .mcap"),
+    "no folder": (("nowhere/fixes.mcap",), "nowhere/fixes.mcap: is a folder, or stands in none"),
+    "a folder": (("a.mcap", "--force"), "a.mcap: is a folder"),
 }
 
 
@@ -244,6 +246,7 @@ REFUSED = {
 def test_an_export_that_cannot_be_is_refused(lumidock, run, tmp_path, words, match, monkeypatch):
     monkeypatch.chdir(tmp_path)
     simulate(tmp_path / "other", "path.end_z_m=3.0")
+    (tmp_path / "a.mcap").mkdir()
     code, out, err = lumidock("export", run, *words)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert match in err

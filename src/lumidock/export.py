@@ -30,12 +30,15 @@ def export(
 ) -> int:
     """Write the run folder `run` as `target`, with the pictures of the `source` it was made from; returns the frames.
 
-    Raises: InputError, one line, for a folder that is no run, another source than the run's, or an unknown ending.
+    Raises: InputError, one line, for a folder that is no run, another source than the run's, an unknown ending, or a
+    place where no file can be.
     """
     if target.suffix not in KINDS:
         raise InputError(f"{target}: not one of {', '.join(KINDS)}")
     if target.suffix == ".mp4" and source is None:
         raise InputError(f"{target}: a video needs the pictures; give --source")
+    if target.is_dir() or not target.parent.is_dir():
+        raise InputError(f"{target}: is a folder, or stands in none")
     begun = target.with_name(f".{target.stem}.begun{target.suffix}")  # a file that is there stays until all is written
     try:
         done = _write(run, begun, source, vehicle, progress)

@@ -308,7 +308,7 @@ class Localizer:
         nothing = np.full(len(self.station), -1, np.int64)
         self.beliefs = [replace(b, name=nothing, proof=0 if reason == "residual" else b.proof) for b in self.beliefs]
         age_s = (detections.t_ns - self.beliefs[0].lights_ns) * 1e-9
-        if self.beliefs[0].proof == 0:  # nothing has agreed since a test failed
+        if self.beliefs[0].proof == 0:  # nothing has agreed since a test failed, or for too long
             return self._no_fix(detections, "coasting", "residual")
         if age_s > self.config.integrity.max_age_s:
             return self._no_fix(detections, "coasting", "stale")
