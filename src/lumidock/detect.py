@@ -15,7 +15,8 @@ from __future__ import annotations
 import numpy as np
 
 from lumidock._kernels import detect as kernels
-from lumidock._kernels import fields, tiles
+from lumidock._kernels import fields, patch, tiles
+from lumidock._kernels.samples import Picture
 from lumidock.config import DetectConfig
 from lumidock.datatypes import Array, Detections, Frame
 
@@ -37,32 +38,48 @@ class Scan:
         h, w = -(-height // tiles.TILE_PX), -(-width // tiles.TILE_PX)
         hb, wb = -(-h // tiles.BLOCK), -(-w // tiles.BLOCK)
         self.like = (frame.image.shape, dtype, frame.encoding)
-        self.channels = 3 if frame.image.ndim == 3 else 1
-        self.planes = 4 if frame.encoding.startswith("bayer") else self.channels
-        self.scale = 1.0 if dtype == np.uint8 else _SIXTEEN
-        maps = 1 if self.planes == 1 else 3
+        shown = picture(frame)
+        planes, channels = shown.planes, 3 if shown.planes == 3 else 1
+        maps = 1 if planes == 1 else 3
         self.known = tiles.Map(
-            peak=np.zeros((maps, h, w), dtype),
-            raw_level=np.zeros((maps, hb, wb), dtype),
+            peak=np.zeros((maps, h, w), np.uint16),
+            raw_level=np.zeros((maps, hb, wb), np.uint16),
             raw_sigma=np.zeros((hb, wb), np.float32),
             by_plane=np.zeros((2, maps, hb, -(-wb // tiles.SPARSE)), np.float32),
             level=np.zeros((maps, hb, wb), np.float32),
             sigma=np.zeros((hb, wb), np.float32),
             spread=np.ones(maps),
             shared=np.ones(4),
-            line=np.empty((3, w * tiles.TILE_PX * self.channels), dtype),
+            line=np.empty((3, w * tiles.TILE_PX * channels * shown.deep), np.uint8),
+            difference=np.empty((2, w * tiles.TILE_PX * channels), np.int32),
+            middle=np.empty((tiles.BLOCK + 1, w), np.uint16),
+            ordered=np.empty(hb * wb + 4, np.float32),
+            least=np.empty((2, w), np.int32),
+            worth=np.empty(w * tiles.TILE_PX, np.uint8),
             seen=np.zeros((h, w), np.uint8),
             found=np.empty((h * w, 5)),
+            queue=np.empty((2, h * w)),
         )
+        self.close = patch.close_up()
         least_noise = config.min_noise * (1.0 if dtype == np.uint8 else _TWELVE_BITS * _SIXTEEN)
-        self.q = _parameters(config, max(height, width), least_noise, self.planes == 4 or dtype != np.uint8)
+        self.q = _parameters(config, max(height, width), least_noise, planes == 4 or dtype != np.uint8)
         self.most = (config.max_candidates, config.max_measured)
         self.spots, self.count = np.empty((config.max_spots, fields.COLUMNS)), 0
+        self.rects = np.empty((config.max_spots + 1, 4), np.int64)
         self.part = -1  # of SWEEP, whose turn it is; nothing was seen yet
 
     def fits(self, frame: Frame) -> bool:
         """Whether a frame is like those that this was made for."""
         return self.like == (frame.image.shape, frame.image.dtype, frame.encoding)
+
+
+def picture(frame: Frame) -> Picture:
+    """A frame as the kernels take it."""
+    image, (height, width) = np.ascontiguousarray(frame.image), frame.image.shape[:2]
+    planes = 4 if frame.encoding.startswith("bayer") else 3 if image.ndim == 3 else 1
+    deep = image.dtype.itemsize
+    rows = image.reshape(height, -1).view(np.uint8)
+    return Picture(rows, deep, planes, 1.0 if deep == 1 else _SIXTEEN, height, width)
 
 
 def _parameters(config: DetectConfig, longer_side: int, least_noise: float, linear: bool) -> Array:
@@ -92,20 +109,20 @@ def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None, expecte
     if min(frame.image.shape[:2]) < _LEAST_SIDE:
         return _detections(frame, np.empty((0, fields.COLUMNS)))
     scan = scan if scan is not None and scan.fits(frame) else Scan(frame, config)
-    height, width = frame.image.shape[:2]
-    image = np.ascontiguousarray(frame.image).reshape(height, width, scan.channels)
     if expected is None:
         scan.part, expected = -1, _NOWHERE
+    if len(scan.rects) <= len(expected) + scan.count:
+        scan.rects = np.empty((len(expected) + len(scan.spots) + 1, 4), np.int64)
     scan.count, whole = kernels.see(
-        image,
-        scan.planes,
-        scan.scale,
+        picture(frame),
         scan.known,
+        scan.close,
         scan.part,
         expected,
         scan.count,
         scan.most,
         scan.q,
+        scan.rects,
         scan.spots,
     )
     scan.part = 0 if whole else (scan.part + 1) % SWEEP

@@ -10,6 +10,7 @@ import numpy as np
 from lumidock._kernels.colors import colors
 from lumidock.config import LabelConfig
 from lumidock.datatypes import Array, Detections, Frame, Indices
+from lumidock.detect import picture
 
 _CLIPPED = 250.0  # of 255
 _OF_LETTER = {"b": 0, "g": 1, "r": 2}
@@ -28,13 +29,10 @@ def label(frame: Frame, detections: Detections, config: LabelConfig) -> Detectio
         return replace(detections, p_rear=np.full(len(detections), np.nan))
     p_rear = np.empty(len(detections))
     decide = (config.blue_ratio, config.softness, config.min_signal, config.limit)
-    image = frame.image[:, :, None] if mosaic else frame.image
     colors(
-        image,
-        4 if mosaic else 3,
+        picture(frame),
         _order(frame.encoding),
-        1.0 if image.dtype == np.uint8 else 255.0 / 65535.0,
-        _LINEAR if mosaic or image.dtype != np.uint8 else _linear(config.gamma),
+        _LINEAR if mosaic or frame.image.dtype != np.uint8 else _linear(config.gamma),
         _CLIPPED,
         detections.uv,
         detections.radius_px,

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lumidock.datatypes import Array, Image, Indices
+from lumidock._kernels import inner, samples, summing
+from lumidock._kernels.samples import Picture
+from lumidock.datatypes import Array, Indices
 
-_SAMPLES, _RIM_SAMPLES = 16, 12  # a side of a window at most: of the spot, and of its surroundings
+_SAMPLES, _RIM_SAMPLES = 12, 9  # a side of a window at most: of the spot, and of its surroundings
 _CLIP_ROUNDS, _CLIP = 2, 2.5  # outliers of the background, in sigmas
 
 
 @njit(cache=True, error_model="numpy")
 def colors(
-    image: Image,
-    planes: int,
+    picture: Picture,
     order: Indices,
-    scale: float,
     linear: Array,
     clipped: float,
     uv: Array,
@@ -33,47 +33,76 @@ def colors(
     the lamp, so the ring around it is asked, from `clear_px` beyond its edge to `ring` radii + px. `decide`: see
     `_of_light`. NaN where there is too little light.
     """
-    pitch = 2 if planes == 4 else 1
-    value = np.empty(4)
-    rim = np.empty((3, (_RIM_SAMPLES + 4) ** 2))
-    total, count, signal, sigma = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    pitch = 2 if picture.planes == 4 else 1
+    rim = np.empty((3, 2 * (_RIM_SAMPLES + 4) ** 2), np.float32)
+    light = np.empty((4, 3))  # of each colour: sum, number of samples, over the background, 1 sigma
     for n in range(len(uv)):
         u, v = uv[n]
-        outer = ring[0] * radius[n] + ring[1]
-        reach = 2.0 * outer + 2.0
-        step = pitch * (1 + int(2.0 * reach) // (_SAMPLES * pitch))
-        coarse = pitch * (1 + int(2.0 * reach) // (_RIM_SAMPLES * pitch))
-        inner = max(radius[n], least_reach_px)
-        burnt = _is_burnt(image, scale, clipped, u, v, inner)
-        low, high = (radius[n] + clear_px, outer) if burnt else (0.0, inner)
+        outer, inside = ring[0] * radius[n] + ring[1], max(radius[n], least_reach_px)
+        burnt = _is_burnt(picture, clipped, u, v, inside)
+        low, high = (radius[n] + clear_px, outer) if burnt else (0.0, inside)
+        step = pitch * (1 + int(2.0 * (2.0 * outer + 2.0)) // (16 * pitch))
         fine = max(step // 2 // pitch * pitch, pitch) if high < 8.0 else step
-        total[:], count[:], dark = 0.0, 0.0, 0
-        center_u, center_v = u - 0.5 * (pitch - 1), v - 0.5 * (pitch - 1)
-        for y in _steps(v, high, image.shape[0], pitch, fine):
-            for x in _steps(u, high, image.shape[1], pitch, fine):
-                square = (x - center_u) ** 2 + (y - center_v) ** 2
-                if low * low <= square <= high * high and _read(image, planes, scale, y, x, value) < clipped:
-                    for p in range(planes):
-                        total[order[p]] += _light(value[p], linear)
-                        count[order[p]] += 1.0
-        for y in _steps(v, reach, image.shape[0], pitch, coarse):
-            for x in _steps(u, reach, image.shape[1], pitch, coarse):
-                if (x - u) ** 2 + (y - v) ** 2 > 2.25 * outer * outer and dark < rim.shape[1]:
-                    _read(image, planes, scale, y, x, value)
-                    for p in range(planes):
-                        rim[order[p], dark] = _light(value[p], linear)
-                    dark += 1
+        _add_disc(picture, order, linear, clipped, u, v, low, high, fine, light)
+        dark = _rim(picture, order, linear, u, v, outer, rim)
         p_rear[n] = np.nan
-        if dark == 0 or count.min() == 0.0:
+        if dark == 0 or min(light[1, 0], min(light[1, 1], light[1, 2])) == 0.0:
             continue
         for c in range(3):
             level, spread = _clipped_moments(rim[c, :dark])
-            signal[c] = total[c] / count[c] - level
-            sigma[c] = spread / np.sqrt(count[c]) + 1e-3
-        p_rear[n] = _of_light(signal, sigma, decide)
+            light[2, c] = light[0, c] / light[1, c] - level
+            light[3, c] = spread / np.sqrt(light[1, c]) + 1e-3
+        p_rear[n] = _of_light(light[2], light[3], decide)
 
 
-@njit(error_model="numpy")
+@inner
+def _add_disc(
+    picture: Picture,
+    order: Indices,
+    linear: Array,
+    clipped: float,
+    u: float,
+    v: float,
+    low: float,
+    high: float,
+    step: int,
+    light: Array,
+) -> None:
+    """Write the sums of light of each colour, and how many samples of it, between two radii around a place."""
+    light[:2] = 0.0
+    pitch = 2 if picture.planes == 4 else 1
+    center_u, center_v = u - 0.5 * (pitch - 1), v - 0.5 * (pitch - 1)
+    for y in _steps(v, high, picture.height, pitch, step):
+        for x in _steps(u, high, picture.width, pitch, step):
+            square = (x - center_u) ** 2 + (y - center_v) ** 2
+            if not low * low <= square <= high * high:
+                continue
+            most = 0.0
+            for p in range(picture.planes):
+                most = max(most, samples.sample(picture, p, y, x))
+            if most < clipped:
+                for p in range(picture.planes):
+                    light[0, order[p]] += _light(samples.sample(picture, p, y, x), linear)
+                    light[1, order[p]] += 1.0
+
+
+@inner
+def _rim(
+    picture: Picture, order: Indices, linear: Array, u: float, v: float, outer: float, rim: Array
+) -> int:
+    """Write the light of each colour in the surroundings of a spot to `rim` (3, N); returns how many samples."""
+    pitch, reach, count = 2 if picture.planes == 4 else 1, 2.0 * outer + 2.0, 0
+    step = pitch * (1 + int(2.0 * reach) // (_RIM_SAMPLES * pitch))
+    for y in _steps(v, reach, picture.height, pitch, step):
+        for x in _steps(u, reach, picture.width, pitch, step):
+            if (x - u) ** 2 + (y - v) ** 2 > 2.25 * outer * outer and count < rim.shape[1]:
+                for p in range(picture.planes):
+                    rim[order[p], count] = _light(samples.sample(picture, p, y, x), linear)
+                count += 1
+    return count
+
+
+@inner
 def _of_light(signal: Array, sigma: Array, decide: tuple[float, float, float, float]) -> float:
     """P(rear) from linear light (3,) of B, G, R and its error, NaN where it is too weak.
 
@@ -89,40 +118,32 @@ def _of_light(signal: Array, sigma: Array, decide: tuple[float, float, float, fl
     return min(max(1.0 / (1.0 + np.exp(-odds)), limit), 1.0 - limit)
 
 
-@njit(error_model="numpy")
+@inner
 def _steps(center: float, reach: float, size: int, pitch: int, step: int) -> range:
     """Rows or columns around a place, as far as they are in the picture."""
     return range(max(int(center - reach), 0) // pitch * pitch, min(int(center + reach) + 2, size - pitch + 1), step)
 
 
-@njit(error_model="numpy")
-def _read(image: Image, planes: int, scale: float, y: int, x: int, value: Array) -> float:
-    """Samples of all planes at a pixel, or in a cell of a mosaic; returns the largest."""
-    largest = 0.0
-    for p in range(planes):
-        value[p] = scale * (image[y, x, p] if planes == 3 else image[y + (p >> 1), x + (p & 1), 0])
-        largest = max(largest, value[p])
-    return largest
-
-
-@njit(error_model="numpy")
+@inner
 def _light(value: float, linear: Array) -> float:
     return float(linear[min(int(value + 0.5), 255)]) if len(linear) else value
 
 
-@njit(error_model="numpy")
-def _is_burnt(image: Image, scale: float, clipped: float, u: float, v: float, reach: float) -> bool:
-    step = 1 + int(reach) // 8
-    for y in range(max(int(v - reach), 0), min(int(v + reach) + 2, image.shape[0]), step):
-        for x in range(max(int(u - reach), 0), min(int(u + reach) + 2, image.shape[1]), step):
+@inner
+def _is_burnt(picture: Picture, clipped: float, u: float, v: float, reach: float) -> bool:
+    """Whether any sample of a disc is saturated."""
+    step, channels = 1 + int(reach) // 8, 3 if picture.planes == 3 else 1
+    limit = clipped / picture.scale
+    for y in range(max(int(v - reach), 0), min(int(v + reach) + 2, picture.height), step):
+        for x in range(max(int(u - reach), 0), min(int(u + reach) + 2, picture.width), step):
             if (x - u) ** 2 + (y - v) ** 2 <= reach * reach:
-                for p in range(image.shape[2]):
-                    if scale * image[y, x, p] >= clipped:
+                for p in range(channels):
+                    if samples.value(picture, y, channels * x + p) >= limit:
                         return True
     return False
 
 
-@njit(error_model="numpy", fastmath={"reassoc", "contract"})
+@summing
 def _clipped_moments(values: Array) -> tuple[float, float]:
     """Mean and standard deviation without outliers."""
     level, spread = 0.0, np.inf

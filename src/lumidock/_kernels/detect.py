@@ -8,10 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lumidock._kernels import constant, fields, patch, peaks, tiles
+from lumidock._kernels import constant, fields, inlined, inner, peaks, samples, tiles
 from lumidock._kernels.likelihood import dim_glints, dim_small_fry, lamp_probability
 from lumidock._kernels.measure import measure
-from lumidock.datatypes import Array, Image, Indices
+from lumidock._kernels.patch import CloseUp
+from lumidock._kernels.samples import Picture
+from lumidock.datatypes import Array, Indices
 
 SWEEP = 8  # frames in which a tracked search has seen everything
 _DRIFT_PX = 20.0  # around a spot, in which it is looked for in the next frame
@@ -19,32 +21,33 @@ _MOST_WINDOWS = 0.25  # of the frame; for more a full search is cheaper
 _MOST_SHARED = 6.0  # more is a texture
 _NO_LIMIT = 1 << 16  # of a sample
 _NO_CANDIDATE = 1 << 20  # more than there are
+_OF_TILE = tiles.TILE_PX * tiles.TILE_PX
+_LAST_OF_TILE = _OF_TILE - 1
 _STAY, _STEP = constant(0), constant(1)  # along rows or columns
 _SWEPT_STEP = constant(2)  # of rows, in a tracked search's sweep: the smallest spot still has half its height
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def see(
-    image: Image,
-    planes: int,
-    scale: float,
+    picture: Picture,
     known: tiles.Map,
+    close: CloseUp,
     part: int,
     expected: Array,
     before: int,
     most: tuple[int, int],
     q: Array,
+    rects: Indices,
     spots: Array,
 ) -> tuple[int, bool]:
     """Write the spots of a frame to `spots` (N, COLUMNS), the strongest first.
 
-    `image` (H, W, C); `planes` 1, 3 or, for a mosaic, 4; `scale` makes 8-bit levels of its samples. Looked at is all of
-    it, with `part` -1; else the tiles around the `expected` places (n, 3) u, v, reach px, and around the spots of the
-    frame before, which are the first `before` in `spots`, and the `part` of `SWEEP` of the rest. `most`: candidates and
-    measurements. Returns how many spots there are, and whether all was looked at, as where windows are much of it.
+    Looked at is all of the picture, with `part` -1; else the tiles around the `expected` places (n, 3) u, v, reach px,
+    and around the spots of the frame before, which are the first `before` in `spots`, and the `part` of `SWEEP` of the
+    rest; `rects` has room for a window each, and one. `most`: candidates and measurements. Returns how many spots there
+    are, and whether all was looked at, as where windows are much of it.
     """
-    rows, (h, w), blocks = image.reshape(len(image), -1), known.peak.shape[1:], len(known.sigma)
-    rects = np.empty((len(expected) + before + 1, 4), np.int64)
+    planes, (h, w), blocks = picture.planes, known.peak.shape[1:], len(known.sigma)
     count, whole = 0, part < 0
     first, last = part * blocks // SWEEP, (part + 1) * blocks // SWEEP
     if not whole:
@@ -55,60 +58,62 @@ def see(
     if whole:
         count, first, last = 0, 0, blocks
         rects[0, 0], rects[0, 1], rects[0, 2], rects[0, 3] = 0, h, 0, w
-    tiles.survey(rows, planes, (first, last), tiles.EVERY if whole else _SWEPT_STEP, known)
-    for k in range(count):
-        tiles.refresh(rows, planes, rects[k], tiles.EVERY, known.peak, known.line)
+    step = tiles.EVERY if whole else _SWEPT_STEP
+    if picture.deep == 1:
+        tiles.look(picture.rows, known.line, planes, (first, last), step, rects, count, known)
+    else:
+        wide, line = picture.rows.view(np.uint16), known.line.view(np.uint16)
+        tiles.look(wide, line, planes, (first, last), step, rects, count, known)
     if whole or part == SWEEP - 1:
-        tiles.settle(known, q[fields.MIN_NOISE] / scale, 1.0 if planes == 4 else _MOST_SHARED)
-    return _search(image, planes, scale, known, rects[: count + 1], most, q, spots), whole
+        tiles.settle(known, q[fields.MIN_NOISE] / picture.scale, 1.0 if planes == 4 else _MOST_SHARED)
+    rects = rects[: count + 1]
+    count = _candidates(picture, known, rects, most[0], q)
+    tiles.clear(known.seen, rects)  # from here on: tiles of spots
+    n = _measured(picture, known, close, count, most[1], q, spots)
+    for k in range(n):
+        spots[k, fields.P_LIGHT] = lamp_probability(spots[k], q)
+    dim_glints(spots, n, q, known.queue[0])
+    dim_small_fry(spots, n, q, known.queue[0])
+    return n, whole
 
 
-@njit(inline="always", error_model="numpy")
-def _search(
-    image: Image,
-    planes: int,
-    scale: float,
-    known: tiles.Map,
-    rects: Indices,
-    most: tuple[int, int],
-    q: Array,
-    spots: Array,
-) -> int:
-    """Write the spots of the tiles in `rects` (n, 4) to `spots`, see `see`; returns how many."""
-    peak, level, sigma, spread, shared_by_plane = known.peak, known.level, known.sigma, known.spread, known.shared
-    seen, found = known.seen, known.found
-    count = 0
-    clipped = q[fields.CLIPPED] / scale
-    contrast = q[fields.CONTRAST] * np.sqrt(shared_by_plane.max())
+@inner
+def _candidates(picture: Picture, known: tiles.Map, rects: Indices, most: int, q: Array) -> int:
+    """Write the tiles in `rects` (n, 4) that may hold a light's peak to `known.found`; returns how many."""
+    peak, level, sigma, spread, found = known.peak, known.level, known.sigma, known.spread, known.found
+    clipped, count = q[fields.CLIPPED] / picture.scale, 0
+    contrast = q[fields.CONTRAST] * np.sqrt(samples.largest(known.shared))
     for p in range(len(peak)):
-        tiles.clear(seen, rects)  # a tile may hold a light in one plane and noise in another
+        tiles.clear(known.seen, rects)  # a tile may hold a light in one plane and noise in another
         for k in range(len(rects)):
             more = peaks.candidates(
                 peak[p],
                 level[p],
                 sigma,
                 spread[p],
-                q[fields.SIGNAL_NOISE] / scale,
+                q[fields.SIGNAL_NOISE] / picture.scale,
                 contrast,
                 clipped,
-                peak if planes == 3 else peak[p : p + 1],
+                peak if picture.planes == 3 else peak[p : p + 1],
                 rects[k],
-                seen,
+                ((known.least[0], known.least[1]), known.worth),
+                known.seen,
                 found[count:],
             )
             found[count : count + more, 4] = p
             count += more
-    count = _most_outstanding(found, count, most[0])
-    queue, waiting, at, n_waiting = _brightest_first(planes, peak, int(clipped), found, count), np.empty(count), 0, 0
-    tiles.clear(seen, rects)  # from here on: tiles of spots
-    n, work = 0, most[1]
-    side = patch.SIDE + 16
-    window = (
-        np.empty((side, side)),
-        np.zeros((side, side), np.int16),
-        np.empty((side * side, 2), np.int32),
-        np.empty(patch.SUMS),
-    )
+    return _most_outstanding(found, count, most, known.queue[0])
+
+
+@inner
+def _measured(
+    picture: Picture, known: tiles.Map, close: CloseUp, count: int, most: int, q: Array, spots: Array
+) -> int:
+    """Measure the `count` candidates, the brightest first, until `most` are; returns how many spots there are."""
+    planes, peak, seen, found = picture.planes, known.peak, known.seen, known.found
+    clipped = int(q[fields.CLIPPED] / picture.scale)
+    queue, waiting, at, n_waiting, n, work = known.queue[0], known.queue[1], 0, 0, 0, most
+    _brightest_first(planes, peak, clipped, found, count, queue)
     while (at < count or n_waiting) and n < len(spots) and work > 0:
         ranked = n_waiting > 0 and (at == count or waiting[n_waiting - 1] < queue[at])
         k = int((waiting[n_waiting - 1] if ranked else queue[at]) % _NO_CANDIDATE)
@@ -117,60 +122,63 @@ def _search(
         if seen[i, j]:
             continue
         if not ranked:
-            v, u, rank = _brightest(image, planes, p, i, j)
-            found[k, 2], found[k, 3] = rank, v * image.shape[1] + u
+            v, u, rank = _brightest(picture, p, i, j)
+            found[k, 2], found[k, 3] = rank, v * picture.width + u
             if planes == 3 and peak[p, i, j] >= clipped:  # its place in the queue was the best that it could have
                 n_waiting = _insert(waiting, n_waiting, k - _NO_CANDIDATE * float(rank))
                 continue
-        rank, v, u = int(found[k, 2]), int(found[k, 3]) // image.shape[1], int(found[k, 3]) % image.shape[1]
-        v, u, is_peak = _peak_pixel(image, planes, p, v, u, rank, peak[p, i, j] >= clipped, int(clipped))
+        rank, v, u = int(found[k, 2]), int(found[k, 3]) // picture.width, int(found[k, 3]) % picture.width
+        v, u, is_peak = _peak_pixel(picture, p, v, u, rank, peak[p, i, j] >= clipped, clipped)
         if not is_peak or seen[v // tiles.TILE_PX, u // tiles.TILE_PX]:
             continue
-        noise = max(scale * sigma[i // tiles.BLOCK, j // tiles.BLOCK], q[fields.MIN_NOISE])
-        status = measure(
-            image, planes, scale, peak, i, j, v, u, p, level, noise, shared_by_plane, q, window, seen, spots, n
-        )
+        noise = max(picture.scale * known.sigma[i // tiles.BLOCK, j // tiles.BLOCK], q[fields.MIN_NOISE])
+        status = measure(picture, known, close, (i, j), v, u, p, noise, q, spots, n)
         work -= status >= 0
         n += status > 0
-    for k in range(n):
-        spots[k, fields.P_LIGHT] = lamp_probability(spots[k], q)
-    dim_glints(spots, n, q)
-    dim_small_fry(spots, n, q)
     return n
 
 
-@njit(error_model="numpy")
-def _most_outstanding(found: Array, count: int, most: int) -> int:
+@inner
+def _most_outstanding(found: Array, count: int, most: int, scratch: Array) -> int:
     """Move the `most` candidates that stand out most to the front; returns how many there are."""
     if count <= most:
         return count
-    least = np.sort(found[:count, 2])[count - most]
-    kept = 0
+    for k in range(count):
+        scratch[k] = found[k, 2]
+    least, kept = tiles.select(scratch, count, count - most), 0
     for k in range(count):
         if found[k, 2] >= least and kept < most:
-            found[kept] = found[k]
+            for c in range(found.shape[1]):
+                found[kept, c] = found[k, c]
             kept += 1
     return kept
 
 
-@njit(error_model="numpy")
-def _brightest_first(planes: int, peak: Image, clipped: int, found: Array, count: int) -> Array:
-    """The candidates by their tile's largest value, the brightest first: their number less `_NO_CANDIDATE` times that.
+@inner
+def _brightest_first(planes: int, peak: Array, clipped: int, found: Array, count: int, queue: Array) -> None:
+    """Queue the candidates by their tile's largest value, the brightest first: their number less `_NO_CANDIDATE` times it.
 
     Saturated ones of three channels by the highest rank that their brightest pixel may have: it tells a core from its
     halo.
     """
-    queue = np.empty(count)
     for k in range(count):
         i, j, p = int(found[k, 0]), int(found[k, 1]), int(found[k, 4])
         rank = 1024.0 * peak[p, i, j]
         if planes == 3 and peak[p, i, j] >= clipped:
             rank += float(peak[0, i, j]) + float(peak[1, i, j]) + float(peak[2, i, j])
         queue[k] = k - _NO_CANDIDATE * rank
-    return np.sort(queue)
+    gap = count // 2
+    while gap > 0:  # Shell's sort
+        for k in range(gap, count):
+            value, m = queue[k], k
+            while m >= gap and queue[m - gap] > value:
+                queue[m] = queue[m - gap]
+                m -= gap
+            queue[m] = value
+        gap = 1 if gap == 2 else int(gap / 2.2)
 
 
-@njit(error_model="numpy")
+@inner
 def _insert(waiting: Array, count: int, value: float) -> int:
     """Insert into the first `count` values, of which the smallest is the last; returns the new count."""
     k = count
@@ -181,80 +189,82 @@ def _insert(waiting: Array, count: int, value: float) -> int:
     return count + 1
 
 
-@njit(error_model="numpy")
-def _brightest(image: Image, planes: int, p: int, i: int, j: int) -> tuple[int, int, int]:
-    """Row, column and rank of a tile's brightest pixel of a map."""
-    best, row, column = -1, 0, 0
-    top, left = i * tiles.TILE_PX, j * tiles.TILE_PX
-    step = 2 if planes == 4 else 1
-    for v in range(top, min(top + tiles.TILE_PX, image.shape[0])):
-        first = left + ((p - v) & 1 if planes == 4 else 0)
-        if planes == 4 and p != 1 and v & 1 != p >> 1:
+@inner
+def _brightest(picture: Picture, p: int, i: int, j: int) -> tuple[int, int, int]:
+    """Row, column and rank of a tile's brightest pixel of a map, the first of several."""
+    top, left, step, mosaic = i * tiles.TILE_PX, j * tiles.TILE_PX, 1, picture.planes == 4
+    right, best = min(left + tiles.TILE_PX, picture.width), -1
+    for v in range(top, min(top + tiles.TILE_PX, picture.height)):
+        if mosaic and p != 1 and v & 1 != p >> 1:
             continue
-        line = image[v]
-        for u in range(first, min(left + tiles.TILE_PX, image.shape[1]), step):
-            rank = int(line[u, 0])
-            if planes == 3:
-                rank = 1024 * int(line[u, p]) + int(line[u, 0]) + int(line[u, 1]) + int(line[u, 2])
-            if rank > best:
-                best, row, column = rank, v, u
-    return row, column, best
+        first = left
+        if mosaic:
+            first, step = left + ((p - v) & 1), 2
+        after = tiles.TILE_PX * (top - v) + left + _LAST_OF_TILE  # less for every pixel, so that the first wins
+        if picture.deep == 1 and picture.planes != 3:
+            line = picture.rows[v]
+            for u in range(first, right, step):
+                best = max(best, _OF_TILE * int(line[u]) + after - u)
+        else:
+            for u in range(first, right, step):
+                best = max(best, _OF_TILE * _rank(picture, p, v, u) + after - u)
+    at = _LAST_OF_TILE - best % _OF_TILE
+    return top + at // tiles.TILE_PX, left + at % tiles.TILE_PX, best // _OF_TILE
 
 
-@njit(error_model="numpy")
+@inner
 def _peak_pixel(
-    image: Image, planes: int, p: int, row: int, column: int, best: int, saturated: bool, clipped: int
+    picture: Picture, p: int, row: int, column: int, best: int, saturated: bool, clipped: int
 ) -> tuple[int, int, bool]:
     """Row and column of the middle of the plateau that a tile's brightest pixel of a map, of rank `best`, stands on.
 
     And whether it is a peak: none next to it, beyond the tile, is brighter.
     """
-    reach = 2 if planes == 4 else 1
-    for v in range(max(row - reach, 0), min(row + reach + 1, image.shape[0])):
-        for u in range(max(column - reach, 0), min(column + reach + 1, image.shape[1])):
-            if _rank(image, planes, p, v, u) > best:
+    reach = 2 if picture.planes == 4 else 1
+    for v in range(max(row - reach, 0), min(row + reach + 1, picture.height)):
+        for u in range(max(column - reach, 0), min(column + reach + 1, picture.width)):
+            if _rank(picture, p, v, u) > best:
                 return row, column, False
     farthest = 64 if saturated else tiles.TILE_PX
-    least, most, white = best, _NO_LIMIT, (1027 if planes == 3 else 1) * clipped
-    if _rank(image, planes, p, row, column, clipped) == white:
+    least, most, white = best, _NO_LIMIT, (1027 if picture.planes == 3 else 1) * clipped
+    if _rank(picture, p, row, column, clipped) == white:
         # noise in what is clipped in every channel would cut the run short, and a core be measured from its rim
         least, most = white, clipped
     for _ in range(2):
-        row = _middle_of_run(image, planes, p, row, column, _STEP, _STAY, least, most, farthest)
-        column = _middle_of_run(image, planes, p, row, column, _STAY, _STEP, least, most, farthest)
+        row = _middle_of_run(picture, p, row, column, _STEP, _STAY, least, most, farthest)
+        column = _middle_of_run(picture, p, row, column, _STAY, _STEP, least, most, farthest)
     return row, column, best > 0
 
 
-@njit(error_model="numpy")
+@inner
 def _middle_of_run(
-    image: Image, planes: int, p: int, v: int, u: int, dv: int, du: int, rank: int, most: int, farthest: int
+    picture: Picture, p: int, v: int, u: int, dv: int, du: int, rank: int, most: int, farthest: int
 ) -> int:
     """Row or column in the middle of the run of pixels of at least this rank through a pixel, along one of both."""
-    pitch = 2 if planes == 4 else 1
-    ends = [0, 0]
-    for side in range(2):
-        sign = 1 if side else -1
+    pitch, before, after = 2 if picture.planes == 4 else 1, 0, 0
+    for sign in (-1, 1):
         k = pitch
         while k < farthest * pitch:
             y, x = v + sign * dv * k, u + sign * du * k
-            if not (0 <= y < image.shape[0] and 0 <= x < image.shape[1]) or _rank(image, planes, p, y, x, most) < rank:
+            inside = 0 <= y < picture.height and 0 <= x < picture.width
+            if not inside or _rank(picture, p, y, x, most) < rank:
                 break
             k += pitch
-        ends[side] = sign * (k - pitch)
-    return (v if dv else u) + (ends[0] + ends[1]) // (2 * pitch) * pitch
+        before, after = after, sign * (k - pitch)
+    return (v if dv else u) + (before + after) // (2 * pitch) * pitch
 
 
-@njit(error_model="numpy")
-def _rank(image: Image, planes: int, p: int, v: int, u: int, most: int = _NO_LIMIT) -> int:
+@inlined
+def _rank(picture: Picture, p: int, v: int, u: int, most: int = _NO_LIMIT) -> int:
     """Order of a pixel in map `p`: by its value there, among equals by all channels, which tell a saturated core.
 
     Values over `most` count as it.
     """
-    if planes == 4 and (v & 1) + (u & 1) != p:
+    if picture.planes == 4 and (v & 1) + (u & 1) != p:
         return -1
-    if planes != 3:
-        return min(int(image[v, u, 0]), most)
-    rank = 1024 * min(int(image[v, u, p]), most)
+    if picture.planes != 3:
+        return min(samples.value(picture, v, u), most)
+    rank = 1024 * min(samples.value(picture, v, 3 * u + p), most)
     for k in range(3):
-        rank += min(int(image[v, u, k]), most)
+        rank += min(samples.value(picture, v, 3 * u + k), most)
     return rank

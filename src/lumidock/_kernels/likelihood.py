@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from lumidock._kernels import fields
+from lumidock._kernels import fields, inner
 from lumidock.datatypes import Array
 
 _LOG_BAD_PIXEL = -2.3  # prior log odds that a small spot is a bad pixel
 
 
-@njit(error_model="numpy")
+@inner
 def lamp_probability(spot: Array, q: Array) -> float:
     """Probability of being a lamp, from contrast, shape, size and blur: soft, so that geometry can overrule it."""
     radius = spot[fields.RADIUS]
@@ -28,15 +27,19 @@ def lamp_probability(spot: Array, q: Array) -> float:
     return float(min(max(seen * shape * size * alone * blurred, 0.02), 0.98))
 
 
-@njit(error_model="numpy")
+@inner
 def _logistic(x: float) -> float:
     return float(1.0 / (1.0 + np.exp(-x)))
 
 
-@njit(error_model="numpy")
-def dim_glints(spots: Array, n: int, q: Array) -> None:
-    """Make little of a spot near a much stronger one that may be a lamp: its reflection on the frame beside it."""
-    before = spots[:n, fields.P_LIGHT].copy()
+@inner
+def dim_glints(spots: Array, n: int, q: Array, before: Array) -> None:
+    """Make little of a spot near a much stronger one that may be a lamp: its reflection on the frame beside it.
+
+    `before` (n,): scratch.
+    """
+    for k in range(n):
+        before[k] = spots[k, fields.P_LIGHT]
     for k in range(n):
         for m in range(n):
             du, dv = spots[k, fields.U] - spots[m, fields.U], spots[k, fields.V] - spots[m, fields.V]
@@ -52,13 +55,15 @@ def dim_glints(spots: Array, n: int, q: Array) -> None:
                 break
 
 
-@njit(error_model="numpy")
-def dim_small_fry(spots: Array, n: int, q: Array) -> None:
+@inner
+def dim_small_fry(spots: Array, n: int, q: Array, before: Array) -> None:
     """Make less of spots that are many of a kind, or faint beside the lamps in view.
 
     A dock has a dozen or two lamps, of fluxes within a few hundred of each other; a wall or a cloud of snow has crowds.
+    `before` (n,): scratch.
     """
-    before = spots[:n, fields.P_LIGHT].copy()
+    for k in range(n):
+        before[k] = spots[k, fields.P_LIGHT]
     brightest = 0.0
     for k in range(n):
         if before[k] > 0.5:

@@ -1,19 +1,18 @@
-"""One candidate measured in a window of its own: where it ends, and whether it is a spot at all."""
+"""One candidate measured in a close-up of its own: where it ends, and whether it is a spot at all."""
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from lumidock._kernels import constant, fields, patch, peaks, samples, tiles
-from lumidock._kernels.describe import FILTER_PX, describe, index, peak_value, small_snr
-from lumidock._kernels.patch import Window
-from lumidock.datatypes import Array, Image, Indices
+from lumidock._kernels import fields, inner, patch, peaks, samples, tiles
+from lumidock._kernels.describe import FILTER_PX, describe, holds_another, peak_value, small_snr
+from lumidock._kernels.patch import CloseUp
+from lumidock._kernels.samples import Picture
+from lumidock.datatypes import Array, Image
 
 LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out, until it is round and alone
 _MAX_TILES = 20  # a light is not wider
 _ROUNDS = 4
-_ONLY_MARK = constant(1)
 _QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth having clears 1.8
 # share of a peak's height that a lens that blurs by 0.65 px, 1 sigma, gives the pixels around it; on a mosaic those of
 # other colours get a quarter of it from a lamp of one colour
@@ -22,99 +21,94 @@ _MOST_SHARED = 36.0  # samples over which noise is the same; more is a texture
 _LEAST_STEP = 30.0  # levels by which a saturated light stands out in the plane that shows it best
 
 
-@njit(error_model="numpy")
+@inner
 def measure(
-    image: Image,
-    planes: int,
-    scale: float,
-    peak: Image,
-    i: int,
-    j: int,
+    picture: Picture,
+    known: tiles.Map,
+    close: CloseUp,
+    tile: tuple[int, int],
     v: int,
     u: int,
     p: int,
-    level: Array,
     noise: float,
-    shared_by_plane: Array,
     q: Array,
-    window: Window,
-    seen: Image,
     spots: Array,
     n: int,
 ) -> int:
     """Measure the spot of one candidate tile into `spots[n]`: 1 if there is one, 0 if not, -1 if that was cheap."""
-    weight, where, start = np.zeros(4), np.zeros(7), np.zeros(2, np.int64)
-    radius, clipped = 0.0, scale * peak[:, i, j].max() >= q[fields.CLIPPED]
+    (i, j), planes, weight, ground = tile, picture.planes, close.weight, close.ground
+    radius, clipped = 0.0, picture.scale * peaks.largest(known.peak, i, j) >= q[fields.CLIPPED]
     if clipped:
-        radius = samples.weigh_clipped(image, planes, scale, v, u, _LEAST_STEP, q[fields.MAX_RADIUS_PX], weight)
+        radius = samples.weigh_clipped(picture, v, u, _LEAST_STEP, q[fields.MAX_RADIUS_PX], weight, close.rings)
         if radius == 0.0:
             return -1
     else:
-        radius = min(_extent(peak, i, j, level), q[fields.MAX_RADIUS_PX])
-        sigma = noise * np.sqrt(shared_by_plane[p])
+        radius = min(_extent(known.peak, i, j, known.level), q[fields.MAX_RADIUS_PX])
+        sigma = noise * np.sqrt(known.shared[p])
         plane, small, ring = p + (p == 2 and planes == 4), radius < tiles.TILE_PX, max(radius, q[fields.RING_PX])
-        if not samples.stands_out(image, planes, scale, plane, v, u, ring, sigma, _QUICK, small):
+        if not samples.stands_out(picture, plane, v, u, ring, sigma, _QUICK, small, close.rings[0]):
             return -1
-        samples.weigh(image, planes, scale, v, u, radius, weight)
-    shared = samples.mean_by_square(weight, shared_by_plane)
+        samples.weigh(picture, v, u, radius, weight, close.rings)
+    shared = samples.mean_by_square(weight, known.shared, 1)
     expected = noise * np.sqrt(samples.square(weight))
-    reach = min(max(3.5 * radius, 1.5 * q[fields.RING_PX]), 3.5 * q[fields.MAX_RADIUS_PX])
-    # of the surroundings: level, noise, texture that hides a spot, texture that moves it, how far noise is shared, and
-    # the noise that shows
-    part, ground = 0.0, np.zeros(6)
+    share, reach = 0.0, min(max(3.5 * radius, 1.5 * q[fields.RING_PX]), 3.5 * q[fields.MAX_RADIUS_PX])
     for turn in range(_ROUNDS):
-        patch.cut(image, planes, scale, weight, v, u, reach, patch.COARSE_SIDE, window[0], where)
-        start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
-        ring = 0.9 * reach / where[patch.UNIT]
-        ground[0], spread, uneven = patch.flatten(window[0], where, float(start[0]), float(start[1]), ring)
-        ground[5] = patch.rim_noise(window[0], where)
-        ground[1] = max(ground[5], 0.5 * expected, q[fields.MIN_NOISE] * expected / noise)
-        ground[2] = 0.0 if clipped else np.sqrt(max(spread**2 - 2.0 * ground[1] ** 2, 0.0))
-        ground[3] = np.sqrt(max(uneven**2 - 2.0 * ground[1] ** 2, 0.0))
+        patch.cut(picture, v, u, reach, patch.COARSE_SIDE, close)
+        _surroundings(close, 0.9 * reach, expected, q[fields.MIN_NOISE] * expected / noise, clipped)
         if turn == 0 and not clipped:
-            width = max(FILTER_PX / where[patch.UNIT], 0.7)
-            if (
-                small_snr(window[0], where, float(start[0]), float(start[1]), width, ground, shared)
-                < 0.5 * q[fields.MIN_SNR]
-            ):
+            width = max(FILTER_PX / close.where[patch.UNIT], 0.7)
+            x, y = float(close.where[patch.START_X]), float(close.where[patch.START_Y])
+            if small_snr(close, x, y, width, shared) < 0.5 * q[fields.MIN_SNR]:
                 return -1
         if clipped:
-            patch.smooth(window[0], where)
-        part = _level(image, planes, window, where, start, ground[0], q, spots, n)
-        sums = window[3]
-        if part == 0.0:
+            patch.smooth(close)
+        share = _level(picture, close, q, spots, n)
+        if share == 0.0:
             if not clipped:
-                _own(seen, window, where, start)
+                _own(known.seen, close)
                 return 0
-            if sums[patch.OPEN] == 0.0 or reach >= 3.5 * q[fields.MAX_RADIUS_PX]:
-                _own_plateau(image, planes, scale, weight, v, u, reach, q, window, where, start, seen)
+            if close.sums[patch.OPEN] == 0.0 or reach >= 3.5 * q[fields.MAX_RADIUS_PX]:
+                _own_plateau(picture, close, v, u, reach, q, known.seen)
                 return 0
             reach = min(2.0 * reach, 3.5 * q[fields.MAX_RADIUS_PX])
             continue
-        found = np.sqrt(sums[patch.N] / np.pi) * where[patch.UNIT]
+        found = np.sqrt(close.sums[patch.N] / np.pi) * close.where[patch.UNIT]
         wanted = min(max(3.5 * found, 1.5 * q[fields.RING_PX]), 3.5 * q[fields.MAX_RADIUS_PX])
         if 0.6 * reach <= wanted <= 1.25 * reach or turn == _ROUNDS - 1:
             break
         reach = wanted
-    if part == 0.0:
+    if share == 0.0:
         return 0
-    _own(seen, window, where, start)
-    ground[4] = samples.mean_by_square(weight, shared_by_plane**2)
+    _own(known.seen, close)
+    ground[patch.SHARED] = samples.mean_by_square(weight, known.shared, 2)
     if planes == 3:  # in the sum of channels fine noise is what JPEG leaves, and coarse noise that of the sensor
-        ground[4] = min(max(ground[4] * (expected / ground[1]) ** 2, 1.0), _MOST_SHARED)
+        more = ground[patch.SHARED] * (expected / ground[patch.NOISE]) ** 2
+        ground[patch.SHARED] = min(max(more, 1.0), _MOST_SHARED)
     spots[n, fields.CORE] = 0.0
     for k in range(planes):
-        spots[n, fields.CORE] += samples.core_mean(image, planes, scale, k, v, u) / planes
+        spots[n, fields.CORE] += samples.core_mean(picture, k, v, u) / planes
     spots[n, fields.BY_LENS] = np.inf
     if planes != 3 and not clipped and radius <= tiles.TILE_PX:  # colour is spread by demosaicing, by the lens or not
-        share = _AROUND if planes == 1 else _AROUND_OF_MOSAIC
+        around = _AROUND if planes == 1 else _AROUND_OF_MOSAIC
         spots[n, fields.BY_LENS] = samples.log_lens_over_bad_pixel(
-            image, planes, scale, v, u, q[fields.RING_PX], share, noise
+            picture, v, u, q[fields.RING_PX], around, noise, close.rings
         )
-    return int(describe(image, planes, scale, weight, window, where, start, u, v, part, ground, shared, q, spots, n))
+    return int(describe(picture, close, u, v, share, shared, q, spots, n))
 
 
-@njit(error_model="numpy")
+@inner
+def _surroundings(close: CloseUp, reach: float, expected: float, least: float, clipped: bool) -> None:
+    """Flatten the close-up by the ring of `reach` px, and write what that says of the surroundings to its `ground`."""
+    ground = close.ground
+    level, spread, uneven = patch.flatten(close, reach)
+    rim = patch.rim_noise(close)
+    noise = max(rim, max(0.5 * expected, least))
+    ground[patch.LEVEL], ground[patch.NOISE], ground[patch.RIM] = level, noise, rim
+    ground[patch.HIDES] = 0.0 if clipped else np.sqrt(max(spread**2 - 2.0 * noise**2, 0.0))
+    ground[patch.MOVES] = np.sqrt(max(uneven**2 - 2.0 * noise**2, 0.0))
+
+
+@inner
 def _extent(peak: Image, i: int, j: int, level: Array) -> float:
     """Radius px that the tiles give a spot at half height: of its narrower side, half a tile at least.
 
@@ -130,51 +124,37 @@ def _extent(peak: Image, i: int, j: int, level: Array) -> float:
         step = max(step, peaks.over_pairs(peak[p], i, j, far))
     half = float(peak[p, i, j]) - 0.5 * min(most, 0.5 * step)
     width, height = 1, 1
-    for step in (-1, 1):
+    for way in (-1, 1):
         k = 1
-        while k < _MAX_TILES and 0 <= j + step * k < peak.shape[2] and peak[p, i, j + step * k] > half:
+        while k < _MAX_TILES and 0 <= j + way * k < peak.shape[2] and peak[p, i, j + way * k] > half:
             k += 1
         width += k - 1
         k = 1
-        while k < _MAX_TILES and 0 <= i + step * k < peak.shape[1] and peak[p, i + step * k, j] > half:
+        while k < _MAX_TILES and 0 <= i + way * k < peak.shape[1] and peak[p, i + way * k, j] > half:
             k += 1
         height += k - 1
     return 0.5 * tiles.TILE_PX * min(width, height)
 
 
-@njit(error_model="numpy")
-def _level(
-    image: Image,
-    planes: int,
-    window: Window,
-    where: Array,
-    start: Indices,
-    floor: float,
-    q: Array,
-    spots: Array,
-    n: int,
-) -> float:
+@inner
+def _level(picture: Picture, close: CloseUp, q: Array, spots: Array, n: int) -> float:
     """Grow the spot at the lowest share of its peak where it is round and alone.
 
     If it is round nowhere, at the lowest where it is alone. Returns the share, 0 where the spot is never alone. A
     saturated core in one plane is swollen at half height by its halo, which no colour tells apart: there the lowest
     share is left out.
     """
-    top = peak_value(window[0], where, start)
-    window[1][:] = 0
-    first = 1 if planes == 1 and top >= q[fields.CLIPPED] else 0
-    fallback = 0.0
+    top, floor, sums, fallback = peak_value(close), close.ground[patch.LEVEL], close.sums, 0.0
     if top <= floor:
-        patch.take_all(window[3], where)
+        patch.take_all(close)
         return 0.0
-    for k in range(first, len(LEVELS) + 1):
+    for k in range(1 if picture.planes == 1 and top >= q[fields.CLIPPED] else 0, len(LEVELS) + 1):
         again = k == len(LEVELS)
         if again and fallback == 0.0:
             return 0.0
         share = fallback if again else LEVELS[k]
-        patch.grow(window, where, image, start[0], start[1], floor + share * (top - floor), q[fields.CLIPPED], k + 1)
-        sums = window[3]
-        if _holds_another(window[1], where, k + 1, spots, n):
+        patch.grow(picture, close, floor + share * (top - floor), q[fields.CLIPPED])
+        if holds_another(close, spots, n):
             sums[patch.OPEN] = 0.0  # a wider window does not help
             continue
         if sums[patch.OPEN] > 0.0:
@@ -187,63 +167,37 @@ def _level(
     return 0.0
 
 
-@njit(error_model="numpy")
-def _holds_another(stamp: Image, where: Array, mark: int, spots: Array, n: int) -> bool:
-    """Whether the grown region covers the centre of a spot found before."""
-    for k in range(n):
-        x = int((spots[k, fields.U] - where[patch.LEFT]) / where[patch.UNIT] + 0.5)
-        y = int((spots[k, fields.V] - where[patch.TOP]) / where[patch.UNIT] + 0.5)
-        if 0 <= x < where[patch.COLUMNS] and 0 <= y < where[patch.ROWS] and stamp[y, x] == mark:
-            return True
-    return False
-
-
-@njit(error_model="numpy")
-def _own(seen: Image, window: Window, where: Array, start: Indices) -> None:
+@inner
+def _own(seen: Image, close: CloseUp) -> None:
     """Mark the tiles that the grown region touches: nobody looks there again."""
-    stamp, sums, t = window[1], window[3], tiles.TILE_PX
-    mark, unit, columns = stamp[start[1], start[0]], int(where[patch.UNIT]), int(sums[patch.LAST_COLUMN]) + 1
+    stamp, sums, where, t = close.stamp, close.sums, close.where, tiles.TILE_PX
+    mark, unit, columns = np.int32(where[patch.MARK]), where[patch.UNIT], int(sums[patch.LAST_COLUMN]) + 1
     for y in range(int(sums[patch.FIRST_ROW]), int(sums[patch.LAST_ROW]) + 1):
-        line, x = stamp[y], int(sums[patch.FIRST_COLUMN])
-        top = int(where[patch.TOP]) + y * unit
+        line, x = stamp[y + 1], int(sums[patch.FIRST_COLUMN])
+        top = where[patch.TOP] + y * unit
         last_row = min((top + unit - 1) // t + 1, seen.shape[0])
         while x < columns:
-            if line[x] != mark:
+            if line[x + 1] != mark:
                 x += 1
                 continue
             first = x
-            while x < columns and line[x] == mark:
+            while x < columns and line[x + 1] == mark:
                 x += 1
-            left, right = int(where[patch.LEFT]) + first * unit, int(where[patch.LEFT]) + x * unit - 1
+            left, right = where[patch.LEFT] + first * unit, where[patch.LEFT] + x * unit - 1
             for i in range(top // t, last_row):
                 seen[i, left // t : min(right // t + 1, seen.shape[1])] = 1
 
 
-@njit(error_model="numpy")
-def _own_plateau(
-    image: Image,
-    planes: int,
-    scale: float,
-    weight: Array,
-    v: int,
-    u: int,
-    reach: float,
-    q: Array,
-    window: Window,
-    where: Array,
-    start: Indices,
-    seen: Image,
-) -> None:
+@inner
+def _own_plateau(picture: Picture, close: CloseUp, v: int, u: int, reach: float, q: Array, seen: Image) -> None:
     """Mark the tiles of what is too large to be a light, as far as it is as bright as here in its weakest plane."""
     darkest, least = 0, 1e9
-    for p in range(planes):
-        mean = samples.core_mean(image, planes, scale, p, v, u)
-        if mean <= least:
-            darkest, least = p, mean
-    weight[:] = 0.0
-    weight[darkest] = 1.0
-    patch.cut(image, planes, scale, weight, v, u, reach, patch.COARSE_SIDE, window[0], where)
-    start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
-    window[1][:] = 0
-    patch.grow(window, where, image, start[0], start[1], LEVELS[-1] * least, q[fields.CLIPPED], _ONLY_MARK)
-    _own(seen, window, where, start)
+    for p in range(picture.planes):
+        core = samples.core_mean(picture, p, v, u)
+        if core <= least:
+            darkest, least = p, core
+    close.weight[:] = 0.0
+    close.weight[darkest] = 1.0
+    patch.cut(picture, v, u, reach, patch.COARSE_SIDE, close)
+    patch.grow(picture, close, LEVELS[-1] * least, q[fields.CLIPPED])
+    _own(seen, close)

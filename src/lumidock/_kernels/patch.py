@@ -1,110 +1,166 @@
-"""One light in a small window: cut out, flattened, and grown at a level.
+"""One light close up: cut out of the picture once, flattened, and grown at a level.
 
-A window is one plane of floats in 8-bit grey levels: the planes (colours) weighted by how far the light stands out in
-each. Large windows are thinned out.
+Behind `cut` nobody asks of what type the picture is: the close-up has its planes (colours, or corners of a mosaic's
+cell) as floats in 8-bit grey levels, and their mean, weighted by how far the light stands out in each. Large windows
+are thinned out.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from lumidock._kernels.samples import COS, RING, SIN, insert
+from lumidock._kernels import inlined, inner, summing
+from lumidock._kernels.samples import COS, RING, SIN, Picture, insert, mean
 from lumidock.datatypes import Array, Image, Indices
 
 COARSE_SIDE, SIDE = 32, 48  # samples a side of the window that finds a spot's level, and of the one that measures it
 ROOM = SIDE + 16
+LINES, LINE = 16, 512  # scratch
 _ROOT_TWO = np.sqrt(2.0)
 _LEAST_ROWS = 4.0  # of a field
 # entries of `sums`, see `grow`; weights w are over the level
 N, X, Y, XX, XY, YY, W, WX, WY, CLIPPED, EDGE, OPEN, FIRST_COLUMN, LAST_COLUMN, FIRST_ROW, LAST_ROW = range(16)
 SUMS = 16
-# the window's geometry, see `cut`
-LEFT, TOP, UNIT, COLUMNS, ROWS, SLOPE_U, SLOPE_V = range(7)
-Window = tuple[Array, NDArray[np.int16], NDArray[np.int32], Array]
+# of a window: the picture's column and row of its first sample, pixels a sample, samples a row, rows; where the light's
+# brightest sample is, and the mark of the region grown last
+LEFT, TOP, UNIT, COLUMNS, ROWS, START_X, START_Y, MARK = range(8)
+WHERE = 8
+# of its surroundings: level, noise, texture that hides a spot, texture that moves it, how far noise is shared, the
+# noise that shows, and the slope per pixel
+LEVEL, NOISE, HIDES, MOVES, SHARED, RIM, SLOPE_U, SLOPE_V = range(8)
+GROUND = 8
+_NOTHING, _QUARTER, _TWO, _NO_MARK = np.float32(0.0), np.float32(0.25), np.float32(2.0), np.int32(0)
 
 
-@njit(error_model="numpy")
-def cut(
-    image: Image,
-    planes: int,
-    scale: float,
-    weight: Array,
-    v: int,
-    u: int,
-    reach: float,
-    side: int,
-    patch: Array,
-    where: Array,
-) -> None:
-    """Fill `patch` with the window of `reach` px around a pixel, thinned out to about `side` samples a side.
+class CloseUp(NamedTuple):
+    """Room for the close-up of one light, used for one after the other.
 
-    `where` becomes its left, top, unit, columns, rows.
+    `stack` (4, ROOM, ROOM) its planes and `part` (ROOM, ROOM) their mean by `weight` (4,); `where`, `ground` and `sums`:
+    see above. `stamp` and `taken` (ROOM + 2, ROOM + 2), from row and column 1 on, have the mark of the region that a
+    sample was counted to last, by `grow` and by `soften`; `fitted` (2, 4) amplitude and background of each plane; `runs` (ROOM^2, 5), `rings` (8, RING) and `lines` (LINES,
+    LINE) are scratch.
     """
-    pitch = 2 if planes == 4 else 1
+
+    stack: NDArray[np.float32]
+    part: NDArray[np.float32]
+    stamp: NDArray[np.int32]
+    taken: NDArray[np.int32]
+    runs: NDArray[np.int32]
+    where: Indices
+    ground: Array
+    sums: Array
+    weight: Array
+    fitted: Array
+    rings: NDArray[np.float32]
+    lines: NDArray[np.float32]
+
+
+def close_up() -> CloseUp:
+    """Make room for one."""
+    return CloseUp(
+        stack=np.zeros((4, ROOM, ROOM), np.float32),
+        part=np.zeros((ROOM, ROOM), np.float32),
+        stamp=np.zeros((ROOM + 2, ROOM + 2), np.int32),
+        taken=np.zeros((ROOM + 2, ROOM + 2), np.int32),
+        runs=np.zeros((ROOM * ROOM, 5), np.int32),
+        where=np.zeros(WHERE, np.int64),
+        ground=np.zeros(GROUND),
+        sums=np.zeros(SUMS),
+        weight=np.zeros(4),
+        fitted=np.zeros((2, 4)),
+        rings=np.zeros((8, RING), np.float32),
+        lines=np.zeros((LINES, LINE), np.float32),
+    )
+
+
+@inner
+def cut(picture: Picture, v: int, u: int, reach: float, side: int, close: CloseUp) -> None:
+    """Fill the close-up with the window of `reach` px around a pixel, thinned out to about `side` samples a side."""
+    where = close.where
+    pitch = 2 if picture.planes == 4 else 1
     unit = pitch * max(int(np.ceil(2.0 * reach / (pitch * side))), 1)
     left, top = max(u - int(reach), 0) // pitch * pitch, max(v - int(reach), 0) // pitch * pitch
-    columns = min((min(u + int(reach) + 1, image.shape[1]) - left) // unit, ROOM)
-    rows = min((min(v + int(reach) + 1, image.shape[0]) - top) // unit, ROOM)
-    where[0], where[1], where[2], where[3], where[4] = left, top, unit, max(columns, 1), max(rows, 1)
-    n, m = int(where[COLUMNS]), int(where[ROWS])
-    samples, first = image.reshape(len(image), -1), left * image.shape[2]  # rows of which a loop can take many at once
-    w0, w1, w2, w3 = scale * weight[0], scale * weight[1], scale * weight[2], scale * weight[3]
-    last = image.shape[1] - 1 - left
-    for i in range(m):
-        y, out = top + i * unit, patch[i]
-        line = samples[y, first:]
+    columns = min((min(u + int(reach) + 1, picture.width) - left) // unit, ROOM)
+    rows = min((min(v + int(reach) + 1, picture.height) - top) // unit, ROOM)
+    where[LEFT], where[TOP], where[UNIT], where[COLUMNS], where[ROWS] = left, top, unit, max(columns, 1), max(rows, 1)
+    where[START_X], where[START_Y] = min((u - left) // unit, max(columns, 1) - 1), min((v - top) // unit, max(rows, 1) - 1)
+    if picture.deep == 1:
+        _read(picture.rows, picture, where, close.stack)
+    else:
+        _read(picture.rows.view(np.uint16), picture, where, close.stack)
+    _mix(picture.planes, close)
+
+
+@inner
+def _read(rows: Image, picture: Picture, where: Indices, stack: NDArray[np.float32]) -> None:
+    left, top, unit, n = where[LEFT], where[TOP], where[UNIT], where[COLUMNS]
+    scale, mosaic = np.float32(picture.scale), picture.planes == 4
+    for p in range(picture.planes):
+        step, first = unit, min(left + (p & 1 if mosaic else 0), picture.width - 1)
+        if picture.planes == 3:
+            step, first = 3 * unit, 3 * left + p
+        for i in range(where[ROWS]):
+            line = rows[min(top + i * unit + (p >> 1 if mosaic else 0), picture.height - 1), first:]
+            out = stack[p, i]
+            if step == 1:  # a loop for each step that is frequent, which takes many at once
+                for j in range(n):
+                    out[j] = scale * np.float32(line[j])
+            elif step == 2:
+                for j in range(n):
+                    out[j] = scale * np.float32(line[2 * j])
+            elif step == 3:
+                for j in range(n):
+                    out[j] = scale * np.float32(line[3 * j])
+            else:
+                for j in range(n):
+                    out[j] = scale * np.float32(line[step * j])
+
+
+@inner
+def _mix(planes: int, close: CloseUp) -> None:
+    """Write the weighted mean of the planes to the part."""
+    stack, n, weight = close.stack, close.where[COLUMNS], close.weight
+    w0, w1, w2, w3 = np.float32(weight[0]), np.float32(weight[1]), np.float32(weight[2]), np.float32(weight[3])
+    for i in range(close.where[ROWS]):
+        out, a, b, c, d = close.part[i], stack[0, i], stack[1, i], stack[2, i], stack[3, i]
         if planes == 1:
-            if unit == 1:
-                for j in range(n):
-                    out[j] = scale * line[j]
-            else:
-                for j in range(n):
-                    out[j] = scale * line[j * unit]
+            for j in range(n):
+                out[j] = a[j]
         elif planes == 3:
-            if unit == 1:
-                for j in range(n):
-                    out[j] = w0 * line[3 * j] + w1 * line[3 * j + 1] + w2 * line[3 * j + 2]
-            else:
-                for j in range(n):
-                    x = 3 * j * unit
-                    out[j] = w0 * line[x] + w1 * line[x + 1] + w2 * line[x + 2]
+            for j in range(n):
+                out[j] = w0 * a[j] + w1 * b[j] + w2 * c[j]
         else:
-            odd = samples[min(y + 1, len(image) - 1), first:]
-            if unit == 2 and 2 * n - 1 <= last:
-                for j in range(n):
-                    out[j] = w0 * line[2 * j] + w1 * line[2 * j + 1] + w2 * odd[2 * j] + w3 * odd[2 * j + 1]
-            else:
-                for j in range(n):
-                    x, z = j * unit, min(j * unit + 1, last)
-                    out[j] = w0 * line[x] + w1 * line[z] + w2 * odd[x] + w3 * odd[z]
+            for j in range(n):
+                out[j] = w0 * a[j] + w1 * b[j] + w2 * c[j] + w3 * d[j]
 
 
-@njit(error_model="numpy")
-def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tuple[float, float, float]:
-    """Level, spread and unevenness (1 sigma) of the ring of `radius` around a sample, without its slope.
+@inner
+def flatten(close: CloseUp, reach: float) -> tuple[float, float, float]:
+    """Level, spread and unevenness (1 sigma) of the ring of `reach` px around the start, without its slope.
 
-    The slope, which is taken out of the patch, is what a neighbour's halo adds: by least squares, from opposite samples
+    The slope, which is taken out of the part, is what a neighbour's halo adds: by least squares, from opposite samples
     within Tukey's fences. The level is the mean of the middle half, the spread from the quartiles. The unevenness is
     the spread of what opposite samples differ by: what bends alike on either side displaces nothing.
     """
-    columns, rows = int(where[COLUMNS]), int(where[ROWS])
-    values, ordered = np.empty(RING), np.empty(RING)
+    part, where, values, ordered = close.part, close.where, close.rings[0], close.rings[1]
+    x, y, columns, rows, radius = where[START_X], where[START_Y], where[COLUMNS], where[ROWS], reach / where[UNIT]
+    close.ground[SLOPE_U], close.ground[SLOPE_V] = 0.0, 0.0
     count = 0
     for k in range(RING):
         a, b = int(np.floor(x + radius * COS[k] + 0.5)), int(np.floor(y + radius * SIN[k] + 0.5))
         values[k] = np.nan
         if 0 <= a < columns and 0 <= b < rows:
-            values[k] = patch[b, a]
-            count = insert(ordered, count, patch[b, a])
+            values[k] = part[b, a]
+            count = insert(ordered, count, values[k])
     if count == 0:
         return 0.0, 0.0, 0.0
     quarter = count // 4
     low, high = ordered[quarter], ordered[count - 1 - quarter]
     fence = 1.5 * (high - low)
     gx, gy, opposite = 0.0, 0.0, 0
-    where[SLOPE_U], where[SLOPE_V] = 0.0, 0.0
     for k in range(RING // 2):
         a, b = values[k], values[k + RING // 2]
         if low - fence <= a <= high + fence and low - fence <= b <= high + fence:
@@ -113,235 +169,275 @@ def flatten(patch: Array, where: Array, x: float, y: float, radius: float) -> tu
             opposite += 1
     if opposite < RING // 3:
         spread = (high - low) / 1.35
-        return ordered[quarter : count - quarter].mean(), spread, spread
+        return mean(ordered, quarter, count - quarter), spread, spread
     gx, gy = gx / opposite, gy / opposite
-    count = 0
+    count, pairs, uneven = 0, 0, close.rings[2]
     for k in range(RING):
         if not np.isnan(values[k]):
             count = insert(ordered, count, values[k] - gx * COS[k] - gy * SIN[k])
-    level, spread = ordered[quarter : count - quarter].mean(), (ordered[count - 1 - quarter] - ordered[quarter]) / 1.35
-    uneven, pairs = np.empty(RING // 2), 0
     for k in range(RING // 2):
         odd = abs(0.5 * (values[k] - values[k + RING // 2]) - gx * COS[k] - gy * SIN[k])
         if not np.isnan(odd):
             pairs = insert(uneven, pairs, odd)
+    level, spread = mean(ordered, quarter, count - quarter), (ordered[count - 1 - quarter] - ordered[quarter]) / 1.35
     gx, gy = gx / radius, gy / radius
     if max(abs(gx), abs(gy)) * radius > 0.3 * spread:
-        where[SLOPE_U], where[SLOPE_V] = gx / where[UNIT], gy / where[UNIT]
+        close.ground[SLOPE_U], close.ground[SLOPE_V] = gx / where[UNIT], gy / where[UNIT]
+        slope = np.float32(gx)
         for i in range(rows):
+            line, first = part[i], np.float32(gy * (i - y) - gx * x)
             for j in range(columns):
-                patch[i, j] -= gx * (j - x) + gy * (i - y)
+                line[j] -= first + slope * np.float32(j)
     return level, spread, _ROOT_TWO * uneven[pairs // 2] / 0.674
 
 
-@njit(error_model="numpy")
-def smooth(patch: Array, where: Array) -> None:
+@inner
+def smooth(close: CloseUp) -> None:
     """Average with the neighbours by 1 2 1 in either direction: a clipped core is torn by noise, and by interlacing."""
-    columns, rows = int(where[COLUMNS]), int(where[ROWS])
-    before = np.empty(columns + 2)
+    part, columns, rows, before = close.part, close.where[COLUMNS], close.where[ROWS], close.lines[0]
     for i in range(rows):
-        line = patch[i, :columns]
-        before[0], before[1 : columns + 1], before[columns + 1] = line[0], line, line[columns - 1]
+        line = part[i]
         for j in range(columns):
-            line[j] = 0.25 * (before[j] + 2.0 * before[j + 1] + before[j + 2])
-    above = patch[0, :columns].copy()
+            before[j + 1] = line[j]
+        before[0], before[columns + 1] = line[0], line[columns - 1]
+        for j in range(columns):
+            line[j] = _QUARTER * (before[j] + _TWO * before[j + 1] + before[j + 2])
+    for j in range(columns):
+        before[j] = part[0, j]
     for i in range(rows):
-        line, below = patch[i, :columns], patch[min(i + 1, rows - 1), :columns]
+        line, below = part[i], part[min(i + 1, rows - 1)]
         for j in range(columns):
             here = line[j]
-            line[j] = 0.25 * (above[j] + 2.0 * here + below[j])
-            above[j] = here
+            line[j] = _QUARTER * (before[j] + _TWO * here + below[j])
+            before[j] = here
 
 
-@njit(error_model="numpy")
-def rim_noise(patch: Array, where: Array) -> float:
+@inner
+def rim_noise(close: CloseUp) -> float:
     """1 sigma of a sample, from second differences along the outer rows of a window; large ones, of edges, left out."""
-    columns, rows = int(where[COLUMNS]), int(where[ROWS])
+    columns, rows = close.where[COLUMNS], close.where[ROWS]
     if columns < 5 or rows < 3:
         return 0.0
-    limit, sigma = 1e9, 0.0
+    limit, sigma = np.inf, 0.0
     for _ in range(2):
-        total, count = 0.0, 0
+        total, count = 0.0, 0.0
         for i in (0, 1, rows - 2, rows - 1):
-            for j in range(columns - 4):
-                d = abs(patch[i, j] - 2.0 * patch[i, j + 2] + patch[i, j + 4])
-                if d <= limit:
-                    total += d
-                    count += 1
-        sigma = 0.5117 * total / max(count, 1)
+            more, used = _differences(close.part[i, :columns], limit)
+            total, count = total + more, count + used
+        sigma = 0.5117 * total / max(count, 1.0)
         limit = 8.0 * sigma
     return sigma
 
 
-@njit(error_model="numpy")
-def filtered(patch: Array, where: Array, x: float, y: float, width: float, level: float) -> tuple[float, float]:
+@summing
+def _differences(line: Array, limit: float) -> tuple[float, float]:
+    """Sum and number of the absolute second differences of every other sample that are not over a limit."""
+    total, count, most = np.float32(0.0), np.float32(0.0), np.float32(limit)
+    for j in range(len(line) - 4):
+        d = abs(line[j] - _TWO * line[j + 2] + line[j + 4])
+        used = np.float32(d <= most)
+        total += used * d
+        count += used
+    return float(total), float(count)
+
+
+@inner
+def bell(first: float, step: float, width: float, n: int, out: Array) -> None:
+    """Write a Gaussian of `width` at `n` places `step` apart, the first one `first` from its middle."""
+    value = np.exp(-0.5 * (first / width) ** 2)
+    ratio, ratio_of_ratios = np.exp(-step * (first + 0.5 * step) / width**2), np.exp(-((step / width) ** 2))
+    for k in range(n):
+        out[k] = value
+        value *= ratio
+        ratio *= ratio_of_ratios
+
+
+@inner
+def filtered(close: CloseUp, x: float, y: float, width: float, level: float) -> tuple[float, float]:
     """Amplitude of a Gaussian of `width` samples at a place, and how many samples' worth of averaging is in it."""
-    reach = int(np.ceil(2.5 * width))
-    total, power = 0.0, 1e-12
-    first, last = max(int(x) - reach, 0), min(int(x) + reach + 2, int(where[COLUMNS]))
-    across = np.empty(2 * reach + 2)
-    for j in range(first, last):
-        across[j - first] = np.exp(-0.5 * (j - x) ** 2 / (width * width))
-    for i in range(max(int(y) - reach, 0), min(int(y) + reach + 2, int(where[ROWS]))):
-        b = np.exp(-0.5 * (i - y) ** 2 / (width * width))
-        for j in range(first, last):
-            window = b * across[j - first]
-            total += window * (patch[i, j] - level)
-            power += window * window
+    reach, part, ex, ey = int(np.ceil(2.5 * width)), close.part, close.lines[0], close.lines[1]
+    left, right = max(int(x) - reach, 0), min(int(x) + reach + 2, close.where[COLUMNS])
+    top, bottom = max(int(y) - reach, 0), min(int(y) + reach + 2, close.where[ROWS])
+    bell(left - x, 1.0, width, right - left, ex)
+    bell(top - y, 1.0, width, bottom - top, ey)
+    total, across, down = 0.0, 0.0, 1e-12
+    for j in range(right - left):
+        across += ex[j] * ex[j]
+    for i in range(bottom - top):
+        line, along = part[top + i], 0.0
+        for j in range(right - left):
+            along += ex[j] * (line[left + j] - level)
+        total += ey[i] * along
+        down += ey[i] * ey[i]
+    power = across * down
     return total / power, power
 
 
-@njit(error_model="numpy")
-def grow(window: Window, where: Array, image: Image, x: int, y: int, level: float, clipped: float, mark: int) -> None:
-    """Sum up the connected samples over `level` around one, coordinates relative to it, into the window's sums.
+@inner
+def grow(picture: Picture, close: CloseUp, level: float, clipped: float) -> None:
+    """Sum up the connected samples over `level` around the start, coordinates relative to it, into the sums.
 
     `CLIPPED` counts saturated samples, `EDGE` those at the picture's edge, `OPEN` those at the window's. The first and
     last column and row are the window's.
     """
-    patch, stamp, stack, sums = window
-    columns, rows = int(where[COLUMNS]), int(where[ROWS])
-    at_left, at_top = where[LEFT] <= 1.0, where[TOP] <= 1.0
-    at_right = where[LEFT] + where[UNIT] * columns >= image.shape[1] - 1
-    at_bottom = where[TOP] + where[UNIT] * rows >= image.shape[0] - 1
+    part, stamp, stack, sums, where = close.part, close.stamp, close.runs, close.sums, close.where
+    columns, rows, x, y = where[COLUMNS], where[ROWS], where[START_X], where[START_Y]
+    at_left, at_top = where[LEFT] <= 1, where[TOP] <= 1
+    at_right = where[LEFT] + where[UNIT] * columns >= picture.width - 1
+    at_bottom = where[TOP] + where[UNIT] * rows >= picture.height - 1
+    where[MARK] += 1
+    mark = np.int32(where[MARK])
+    limit, burnt = np.float32(level), np.float32(clipped)
     sums[:] = 0.0
     left, right, upper, lower = x, x, y, y
-    stack[0, 0], stack[0, 1] = x, y
-    stamp[y, x] = 0
+    _push(stack, 0, x, y, y, 0, -1)
     top = 1
     while top:  # a run of one row at a time
         top -= 1
-        first, i = stack[top, 0], stack[top, 1]
-        line, mine = patch[i], stamp[i]
-        if mine[first] == mark:
+        first, i = int(stack[top, 0]), int(stack[top, 1])
+        line, mine = part[i], stamp[i + 1]
+        if mine[first + 1] == mark:
             continue
         last = first + 1
-        while first > 0 and line[first - 1] > level:
+        while first > 0 and line[first - 1] > limit:
             first -= 1
-        while last < columns and line[last] > level:
+        while last < columns and line[last] > limit:
             last += 1
         left, right, upper, lower = min(left, first), max(right, last - 1), min(upper, i), max(lower, i)
-        _add_run(line[first:last], float(first - x), float(i - y), level, clipped, sums)
-        mine[first:last] = mark
+        _add_run(line[first:last], mine[first + 1 : last + 1], mark, first - x, i - y, level, burnt, sums)
         if i == 0 or i == rows - 1:
             sums[EDGE if (at_top if i == 0 else at_bottom) else OPEN] += last - first
         else:
-            for end, at_end in ((first == 0, at_left), (last == columns, at_right)):
-                if end:
-                    sums[EDGE if at_end else OPEN] += 1.0
+            if first == 0:
+                sums[EDGE if at_left else OPEN] += 1.0
+            if last == columns:
+                sums[EDGE if at_right else OPEN] += 1.0
+        behind, begun, ended = int(stack[top, 2]), int(stack[top, 3]), int(stack[top, 4])
         for d in (i - 1, i + 1):
-            new = _unmarked(patch[d, first:last], stamp[d, first:last], level, mark) if 0 <= d < rows else 0
-            for c in range(first, last if new else first):
-                if patch[d, c] > level and stamp[d, c] != mark:
-                    if c == first or not (patch[d, c - 1] > level and stamp[d, c - 1] != mark):
-                        stack[top, 0], stack[top, 1] = c, d
-                        top += 1
-                    if new == last - first:  # all of it is one run
-                        break
+            if not 0 <= d < rows:
+                continue
+            c = first
+            while c < last:
+                if d == behind and begun <= c < ended:  # the run that this one was found from
+                    c = ended
+                elif part[d, c] > limit and stamp[d + 1, c + 1] != mark:
+                    _push(stack, top, c, d, i, first, last)
+                    top += 1
+                    while c < last and part[d, c] > limit:
+                        c += 1
+                else:
+                    c += 1
     sums[FIRST_COLUMN], sums[LAST_COLUMN], sums[FIRST_ROW], sums[LAST_ROW] = left, right, upper, lower
 
 
-@njit(error_model="numpy")
-def take_all(sums: Array, where: Array) -> None:
+@inlined
+def _push(stack: Image, top: int, column: int, row: int, behind: int, begun: int, ended: int) -> None:
+    """Remember where a run goes through, and the run that it was found from."""
+    stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3], stack[top, 4] = column, row, behind, begun, ended
+
+
+@inner
+def take_all(close: CloseUp) -> None:
     """Of a region that is a whole window, its columns and rows."""
-    sums[FIRST_COLUMN], sums[LAST_COLUMN], sums[FIRST_ROW], sums[LAST_ROW] = 0, where[COLUMNS] - 1, 0, where[ROWS] - 1
+    sums = close.sums
+    sums[FIRST_COLUMN], sums[LAST_COLUMN] = 0.0, close.where[COLUMNS] - 1
+    sums[FIRST_ROW], sums[LAST_ROW] = 0.0, close.where[ROWS] - 1
 
 
-@njit(error_model="numpy")
-def _unmarked(values: Array, stamp: Image, level: float, mark: int) -> int:
-    """How many of some samples are over the level and not marked yet."""
-    count = 0
+@summing
+def _add_run(
+    values: Array, marks: Image, mark: int, a: int, b: int, level: float, clipped: float, sums: Array
+) -> None:
+    """Add samples of one row, the first at `a`, `b`, to the sums of a region, and mark them."""
+    n, w, wx, burnt = float(len(values)), np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for k in range(len(values)):
-        count += (values[k] > level) & (stamp[k] != mark)
-    return count
-
-
-@njit(error_model="numpy", fastmath={"reassoc", "contract"})
-def _add_run(values: Array, a: float, b: float, level: float, clipped: float, sums: Array) -> None:
-    """Add samples of one row, the first at `a`, `b`, to the sums of a region."""
-    n, x, xx, w, wx, burnt = float(len(values)), 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(len(values)):
-        weight = values[k] - level
-        x += a
-        xx += a * a
-        w += weight
-        wx += weight * a
-        burnt += values[k] >= clipped
-        a += 1.0
+        w += values[k]
+        wx += values[k] * np.float32(k)
+        burnt += np.float32(values[k] >= clipped)
+        marks[k] = mark
+    x = n * (a + 0.5 * (n - 1.0))
+    weight = w - n * level
     sums[N] += n
     sums[X] += x
     sums[Y] += n * b
-    sums[XX] += xx
+    sums[XX] += a * (x + n * 0.5 * (n - 1.0)) + (n - 1.0) * n * (2.0 * n - 1.0) / 6.0
     sums[XY] += x * b
     sums[YY] += n * b * b
-    sums[W] += w
-    sums[WX] += wx
-    sums[WY] += w * b
+    sums[W] += weight
+    sums[WX] += wx + a * w - level * x
+    sums[WY] += weight * b
     sums[CLIPPED] += burnt
 
 
-@njit(error_model="numpy")
-def soften(window: Window, where: Array, start: Indices, level: float, lower: float) -> None:
-    """Give the region grown last, at `level` around `start`, a soft edge: weights over `lower`, and a rim of a sample.
+@inner
+def soften(close: CloseUp, lower: float) -> tuple[float, float]:
+    """Give the region grown last a soft edge: weights over `lower`, and a rim of a sample.
 
     The edge of an overexposed light is narrower than a sample: cut at one level, its centre would follow the grid.
+    Returns how far the centre by even rows lies from that by odd rows, px: the way between the fields of interlaced
+    video; nothing where rows are left out, or a field has too few.
     """
-    patch, stamp, rim, sums = window
-    columns, rows, mark = int(where[COLUMNS]), int(where[ROWS]), stamp[start[1], start[0]]
-    for k, of in ((W, N), (WX, X), (WY, Y)):
-        sums[k] += (level - lower) * sums[of]
-    left, right = max(int(sums[FIRST_COLUMN]) - 1, 0), min(int(sums[LAST_COLUMN]) + 1, columns - 1)
-    upper, down = max(int(sums[FIRST_ROW]) - 1, 0), min(int(sums[LAST_ROW]) + 1, rows - 1)
-    count = 0
-    for i in range(upper, down + 1):
-        line, mine = patch[i], stamp[i]
-        for j in range(left, right + 1):
-            if line[j] <= lower or mine[j] == mark:
-                continue
-            if _is_beside(stamp, i, j, rows, columns, mark):
-                rim[count, 0], rim[count, 1] = j, i
-                count += 1
-    sums[FIRST_COLUMN], sums[LAST_COLUMN], sums[FIRST_ROW], sums[LAST_ROW] = left, right, upper, down
-    for k in range(count):
-        j, i = rim[k]
-        _add_run(patch[i, j : j + 1], float(j - start[0]), float(i - start[1]), lower, np.inf, sums)
-        stamp[i, j] = mark
+    sums, where, mark = close.sums, close.where, np.int32(close.where[MARK])
+    left, right = max(int(sums[FIRST_COLUMN]) - 1, 0), min(int(sums[LAST_COLUMN]) + 2, where[COLUMNS])
+    upper, down = max(int(sums[FIRST_ROW]) - 1, 0), min(int(sums[LAST_ROW]) + 2, where[ROWS])
+    sums[: WY + 1] = 0.0
+    w0, x0, y0, rows0, w1, x1, y1, rows1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(upper, down):
+        n, x, xx, w, wx = _soft_row(
+            close.part[i, left:right],
+            close.stamp[i, left : right + 2],
+            close.stamp[i + 1, left : right + 2],
+            close.stamp[i + 2, left : right + 2],
+            mark,
+            np.float32(lower),
+            close.taken[i + 1, left + 1 : right + 1],
+        )
+        a, b = float(left - where[START_X]), float(i - where[START_Y])
+        xx, x, wx = xx + a * (2.0 * x + a * n), x + a * n, wx + a * w
+        sums[N] += n
+        sums[X] += x
+        sums[Y] += n * b
+        sums[XX] += xx
+        sums[XY] += x * b
+        sums[YY] += n * b * b
+        sums[W] += w
+        sums[WX] += wx
+        sums[WY] += w * b
+        if i & 1:
+            w1, x1, y1, rows1 = w1 + w, x1 + wx, y1 + w * b, rows1 + (w > 0.0)
+        else:
+            w0, x0, y0, rows0 = w0 + w, x0 + wx, y0 + w * b, rows0 + (w > 0.0)
+    sums[FIRST_COLUMN], sums[LAST_COLUMN], sums[FIRST_ROW], sums[LAST_ROW] = left, right - 1, upper, down - 1
+    if where[UNIT] > 1 or min(rows0, rows1) < _LEAST_ROWS:
+        return 0.0, 0.0
+    return x0 / w0 - x1 / w1, y0 / w0 - y1 / w1
 
 
-@njit(error_model="numpy")
-def _is_beside(stamp: Image, i: int, j: int, rows: int, columns: int, mark: int) -> bool:
-    """Whether one of the eight samples around one has the mark."""
-    for d in range(max(i - 1, 0), min(i + 2, rows)):
-        for c in range(max(j - 1, 0), min(j + 2, columns)):
-            if stamp[d, c] == mark:
-                return True
-    return False
+@summing
+def _soft_row(
+    values: Array, above: Image, here: Image, below: Image, mark: int, lower: float, taken: Image
+) -> tuple[float, float, float, float, float]:
+    """Number, sum of places and of their squares, weight and its first moment of a row's samples that count.
 
-
-@njit(error_model="numpy")
-def fields_apart(window: Window, where: Array, start: Indices, level: float) -> tuple[float, float]:
-    """How far the centre by even rows lies from that by odd rows, px: the way between the fields of interlaced video.
-
-    Of the region grown last, around `start`; nothing where rows are left out, or a field has too few.
+    Those with the mark do, and those over `lower` beside one; the three rows of marks begin one before. `taken` gets it.
     """
-    patch, stamp, mark, sums = window[0], window[1], window[1][start[1], start[0]], window[3]
-    if where[UNIT] > 1.0:
-        return 0.0, 0.0
-    total, rows = np.zeros((2, 3)), np.zeros(2)
-    for i in range(int(sums[FIRST_ROW]), int(sums[LAST_ROW]) + 1):
-        k, before = i & 1, total[i & 1, 0]
-        for j in range(int(sums[FIRST_COLUMN]), int(sums[LAST_COLUMN]) + 1):
-            if stamp[i, j] == mark:
-                w = patch[i, j] - level
-                total[k, 0] += w
-                total[k, 1] += w * (j - start[0])
-                total[k, 2] += w * (i - start[1])
-        rows[k] += total[k, 0] > before
-    if min(rows[0], rows[1]) < _LEAST_ROWS:
-        return 0.0, 0.0
-    return total[0, 1] / total[0, 0] - total[1, 1] / total[1, 0], total[0, 2] / total[0, 0] - total[1, 2] / total[1, 0]
+    n, x, xx, w, wx = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for k in range(len(values)):
+        beside = (above[k] == mark) | (above[k + 1] == mark) | (above[k + 2] == mark) | (here[k] == mark)
+        beside |= (here[k + 2] == mark) | (below[k] == mark) | (below[k + 1] == mark) | (below[k + 2] == mark)
+        over, place = values[k] - lower, np.float32(k)
+        counts = (here[k + 1] == mark) | (beside & (over > _NOTHING))
+        one = np.float32(counts)
+        n += one
+        x += one * place
+        xx += one * place * place
+        w += one * over
+        wx += one * over * place
+        taken[k] = mark if counts else _NO_MARK
+    return float(n), float(x), float(xx), float(w), float(wx)
 
 
-@njit(error_model="numpy")
+@inner
 def shape(sums: Array) -> tuple[float, float]:
     """Ratio of the axes of the ellipse with the region's second moments, and the region's area over the ellipse's."""
     n = sums[N]
@@ -351,7 +447,7 @@ def shape(sums: Array) -> tuple[float, float]:
     return np.sqrt(max(half - turn, 1e-12) / (half + turn)), n / area
 
 
-@njit(error_model="numpy")
+@inner
 def moments(sums: Array) -> tuple[float, float, float]:
     """Second central moments of the region, of samples that are unit squares."""
     n = sums[N]
@@ -360,12 +456,12 @@ def moments(sums: Array) -> tuple[float, float, float]:
     return uu, (sums[XY] - sums[X] * sums[Y] / n) / n, vv
 
 
-@njit(error_model="numpy")
-def balance(sums: Array, variance: float, center: Array, cov: Array) -> None:
-    """Write a region's weighted centre (2,), relative to its start, and its covariance (3,) by noise of `variance`."""
+@inner
+def balance(sums: Array, variance: float) -> tuple[float, float, float, float, float]:
+    """A region's weighted centre x, y, relative to its start, and its covariance xx, xy, yy by noise of `variance`."""
     x, y = sums[WX] / sums[W], sums[WY] / sums[W]
-    center[0], center[1] = x, y
-    cov[0] = sums[XX] - 2.0 * x * sums[X] + sums[N] * x * x
-    cov[1] = sums[XY] - x * sums[Y] - y * sums[X] + sums[N] * x * y
-    cov[2] = sums[YY] - 2.0 * y * sums[Y] + sums[N] * y * y
-    cov *= variance / sums[W] ** 2
+    by_weight = variance / sums[W] ** 2
+    xx = sums[XX] - 2.0 * x * sums[X] + sums[N] * x * x
+    xy = sums[XY] - x * sums[Y] - y * sums[X] + sums[N] * x * y
+    yy = sums[YY] - 2.0 * y * sums[Y] + sums[N] * y * y
+    return x, y, by_weight * xx, by_weight * xy, by_weight * yy

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numpy.typing import NDArray
 
+from lumidock._kernels import inner
 from lumidock._kernels.tiles import BLOCK
 from lumidock.datatypes import Array, Image, Indices
 
@@ -13,7 +14,7 @@ _FAR = 4  # tiles at which the slopes of a wide light show
 _HALO = 40.0  # sigmas over the background that only the halo of something bright reaches beside its peak
 
 
-@njit(error_model="numpy")
+@inner
 def candidates(
     peak: Image,
     level: Array,
@@ -24,6 +25,7 @@ def candidates(
     clipped: float,
     together: Image,
     rect: Indices,
+    scratch: tuple[tuple[NDArray[np.int32], NDArray[np.int32]], Image],
     seen: Image,
     found: Array,
 ) -> int:
@@ -34,19 +36,20 @@ def candidates(
     to it or a few tiles away they are darker by a margin, as on a halo they are not; on a bright one its noise has
     `shot`, a variance per value, on top. A tile that with all around it is saturated in the maps that count `together`
     (Q, h, w) is left to those at the region's rim; so are tiles that are `seen` (h, w), and the others become it.
-    Returns how many there are.
+    Returns how many there are. `scratch`: of a row of tiles, see `tiles.Map`.
     """
-    n, count, least = rect[3] - rect[2], 0, np.empty(peak.shape[1], peak.dtype)
-    worth = np.zeros((n + 7) // 8 * 8, np.uint8)
-    eight = worth.view(np.uint64)  # most are 0
+    n, count, (least, margin), worth = rect[3] - rect[2], 0, scratch[0], scratch[1]
+    eight = worth.view(np.uint64)[: (n + 7) // 8]  # most are 0
+    worth[: 8 * len(eight)] = 0
     for i in range(rect[0], rect[1]):
         b = i // BLOCK
         if i == rect[0] or i % BLOCK == 0:
             for k in range(rect[2] // BLOCK, (rect[3] + BLOCK - 1) // BLOCK):
-                value = min(np.ceil(level[b, k] + contrast * spread * sigma[b, k]), clipped)
+                value = int(min(np.ceil(level[b, k] + contrast * spread * sigma[b, k]), clipped))
+                rise = max(int(_NEARLY * 1.5 * contrast * spread * sigma[b, k]), 2)
                 for j in range(max(k * BLOCK, rect[2]), min((k + 1) * BLOCK, rect[3])):
-                    least[j] = value
-        if not _worth_a_look(peak, i, least, rect[2], rect[3], worth):
+                    least[j], margin[j] = value, rise
+        if not _worth_a_look(peak, i, least, margin, int(clipped), rect[2], rect[3], worth):
             continue
         for part in range(len(eight)):
             if not eight[part]:
@@ -55,7 +58,7 @@ def candidates(
                 if not worth[j - rect[2]] or seen[i, j] or count == len(found):
                     continue
                 here, over = spread * sigma[b, j // BLOCK], peak[i, j] - level[b, j // BLOCK]
-                if not _rises(peak, i, j, max(int(_NEARLY * 1.5 * contrast * here), 2), int(clipped)):
+                if not _rises(peak, i, j, margin[j], int(clipped)):
                     continue
                 local = np.sqrt(here * here + shot * max(over - _HALO * here, 0.0))
                 if not _stands_out(peak, i, j, max(int(1.5 * contrast * local), 2), int(clipped)):
@@ -69,14 +72,20 @@ def candidates(
     return count
 
 
-@njit(error_model="numpy")
-def _worth_a_look(peak: Image, i: int, least: Image, first: int, last: int, worth: Image) -> bool:
-    """Mark the tiles of a part of a row that reach the `least` value and stand on no slope; whether any reach it."""
+@inner
+def _worth_a_look(
+    peak: Image, i: int, least: Image, margin: Image, clipped: int, first: int, last: int, worth: Image
+) -> bool:
+    """Mark the tiles of a part of a row that reach the `least` value and stand on no slope; whether any reach it.
+
+    And that rise over their row by the `margin`, see `_rises`, where it does not end within a few tiles.
+    """
     here, limit, mark = peak[i, first:last], least[first:last], worth[: last - first]
-    total = 0
+    total = np.int32(0)
     for x in range(len(here)):
-        mark[x] = here[x] >= limit[x]
-        total += mark[x]
+        reached = np.int32(here[x]) >= limit[x]
+        mark[x] = reached
+        total += reached
     if total == 0:
         return False
     above, below = peak[max(i - 1, 0), first:last], peak[min(i + 1, len(peak) - 1), first:last]
@@ -84,11 +93,16 @@ def _worth_a_look(peak: Image, i: int, least: Image, first: int, last: int, wort
         most = max(np.int32(here[x - 1]) + np.int32(here[x + 1]), np.int32(above[x]) + np.int32(below[x]))
         most = max(most, np.int32(above[x - 1]) + np.int32(below[x + 1]))
         most = max(most, np.int32(above[x + 1]) + np.int32(below[x - 1]))
-        mark[x] &= 2 * np.int32(here[x]) >= most
+        mark[x] &= np.int32(2) * np.int32(here[x]) >= most
+    burnt, rise = np.int32(clipped), margin[first:last]
+    for x in range(_FAR, len(here) - _FAR):
+        twice = np.int32(2) * np.int32(here[x])
+        rises = (twice - np.int32(here[x - 1]) - np.int32(here[x + 1]) >= rise[x]) | (np.int32(here[x]) >= burnt)
+        mark[x] &= rises | (twice - np.int32(here[x - _FAR]) - np.int32(here[x + _FAR]) >= rise[x])
     return True
 
 
-@njit(error_model="numpy")
+@inner
 def _stands_out(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
     """Whether a tile is neither on a slope nor on a halo, see `candidates`."""
     if not _rises(peak, i, j, margin, clipped):
@@ -104,7 +118,7 @@ def _stands_out(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
     return over_pairs(peak, i, j, _FAR) >= margin
 
 
-@njit(error_model="numpy")
+@inner
 def _rises(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
     """Whether a tile stands out along its row, next to it or a few tiles away: it settles most."""
     w, twice = peak.shape[1], 2 * int(peak[i, j])
@@ -114,7 +128,7 @@ def _rises(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
     return twice - int(peak[i, max(j - _FAR, 0)]) - int(peak[i, min(j + _FAR, w - 1)]) >= margin
 
 
-@njit(error_model="numpy")
+@inner
 def _is_inner(together: Image, i: int, j: int, clipped: int) -> bool:
     """Whether a tile and all around it are saturated in every map."""
     _, h, w = together.shape
@@ -129,7 +143,7 @@ def _is_inner(together: Image, i: int, j: int, clipped: int) -> bool:
     return True
 
 
-@njit(error_model="numpy")
+@inner
 def over_pairs(peak: Image, i: int, j: int, d: int) -> int:
     """Twice the value of a tile less that of two on opposite sides, `d` tiles away, the least of four ways."""
     h, w = peak.shape
@@ -139,3 +153,12 @@ def over_pairs(peak: Image, i: int, j: int, d: int) -> int:
         max(int(peak[top, left]) + int(peak[bottom, right]), int(peak[top, right]) + int(peak[bottom, left])),
     )
     return 2 * int(peak[i, j]) - most
+
+
+@inner
+def largest(peak: Image, i: int, j: int) -> int:
+    """The largest value of a tile in any map."""
+    most = int(peak[0, i, j])
+    for p in range(1, len(peak)):
+        most = max(most, int(peak[p, i, j]))
+    return most

@@ -1,13 +1,12 @@
-"""Samples of a picture around a pixel, plane by plane, and how much each plane counts for a light there.
-
-Samples come as (H, W, C) of an unsigned type, 1 or 3 channels, or one channel that is a Bayer mosaic.
-"""
+"""Samples of a picture around a pixel, plane by plane, and how much each plane counts for a light there."""
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
+from typing import NamedTuple
 
+import numpy as np
+
+from lumidock._kernels import inlined, inner
 from lumidock.datatypes import Array, Image
 
 RING = 24  # samples on a ring
@@ -16,75 +15,117 @@ _ROOT_TWO = np.sqrt(2.0)
 _LEAST_LOST, _SLACK = 0.4, 0.5  # share of its height that a spot loses to the ring; sigmas of noise left to it
 
 
-@njit(error_model="numpy")
-def sample(image: Image, planes: int, p: int, v: int, u: int) -> float:
-    """One sample of plane `p` at pixel or, on a mosaic, in the 2 x 2 cell of a pixel."""
-    if planes == 1:
-        return float(image[v, u, 0])
-    if planes == 3:
-        return float(image[v, u, p])
-    return float(image[min((v & -2) + (p >> 1), image.shape[0] - 1), min((u & -2) + (p & 1), image.shape[1] - 1), 0])
+class Picture(NamedTuple):
+    """A frame as the camera gives it, of any type.
 
-
-@njit(error_model="numpy")
-def core_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int) -> float:
-    """Mean of a plane over 3 x 3 of its samples around a pixel."""
-    pitch = 2 if planes == 4 else 1
-    total, count = 0.0, 0
-    for y in range(max(v - pitch, 0), min(v + pitch + 1, image.shape[0]), pitch):
-        for x in range(max(u - pitch, 0), min(u + pitch + 1, image.shape[1]), pitch):
-            total += sample(image, planes, p, y, x)
-            count += 1
-    return scale * total / count
-
-
-@njit(error_model="numpy")
-def ring_mean(image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float) -> float:
-    """Mean of the second quarter of twelve samples of a plane on a circle around a pixel, 0 where it is outside.
-
-    So nearly half of the circle may lie on something brighter.
+    `rows` (H, n) its bytes, `deep` of which are a sample, least byte first; `planes` 1, 3 or, for a mosaic, 4, of which
+    a sample, in a mosaic a 2 x 2 cell, has one value each; `scale` makes 8-bit grey levels of them.
     """
-    ordered, count = np.empty(12), 0
-    for k in range(0, RING, 2):
-        x, y = int(u + radius * COS[k] + 0.5), int(v + radius * SIN[k] + 0.5)
-        if 0 <= x < image.shape[1] and 0 <= y < image.shape[0]:
-            count = insert(ordered, count, sample(image, planes, p, y, x))
-    if count == 0:
-        return 0.0
-    return float(scale * ordered[count // 4 : count // 2 + 1].mean())
+
+    rows: Image
+    deep: int
+    planes: int
+    scale: float
+    height: int
+    width: int
 
 
-@njit(error_model="numpy")
-def _ring_is_over(image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float, limit: float) -> bool:
-    """Whether the samples of `ring_mean` say without sorting that it is over a limit: all but a quarter of them are."""
-    low, count = 0, 0
-    for k in range(0, RING, 2):
-        x, y = int(u + radius * COS[k] + 0.5), int(v + radius * SIN[k] + 0.5)
-        if 0 <= x < image.shape[1] and 0 <= y < image.shape[0]:
-            low += scale * sample(image, planes, p, y, x) <= limit
+@inlined
+def value(picture: Picture, v: int, x: int) -> int:
+    """The `x`th number of row `v`."""
+    if picture.deep == 1:
+        return int(picture.rows[v, x])
+    return int(picture.rows[v, 2 * x]) + 256 * int(picture.rows[v, 2 * x + 1])
+
+
+@inlined
+def sample(picture: Picture, p: int, v: int, u: int) -> float:
+    """One sample of plane `p`, in grey levels, at a pixel or, on a mosaic, in the 2 x 2 cell of a pixel."""
+    if picture.planes == 1:
+        return picture.scale * value(picture, v, u)
+    if picture.planes == 3:
+        return picture.scale * value(picture, v, 3 * u + p)
+    v, u = min((v & -2) + (p >> 1), picture.height - 1), min((u & -2) + (p & 1), picture.width - 1)
+    return picture.scale * value(picture, v, u)
+
+
+@inner
+def core_mean(picture: Picture, p: int, v: int, u: int) -> float:
+    """Mean of a plane over 3 x 3 of its samples around a pixel."""
+    pitch = 2 if picture.planes == 4 else 1
+    total, count = 0.0, 0
+    for y in range(max(v - pitch, 0), min(v + pitch + 1, picture.height), pitch):
+        for x in range(max(u - pitch, 0), min(u + pitch + 1, picture.width), pitch):
+            total += sample(picture, p, y, x)
             count += 1
-        if low > RING // 8:
-            return False
+    return total / count
+
+
+@inner
+def ring(picture: Picture, v: int, u: int, radius: float, values: Array) -> int:
+    """Write twelve samples of each plane on a circle around a pixel to `values` (4, 12), as far as they are inside.
+
+    Returns how many are.
+    """
+    count = 0
+    for k in range(0, RING, 2):
+        x, y = int(u + radius * COS[k] + 0.5), int(v + radius * SIN[k] + 0.5)
+        if 0 <= x < picture.width and 0 <= y < picture.height:
+            for p in range(picture.planes):
+                values[p, count] = sample(picture, p, y, x)
+            count += 1
+    return count
+
+
+@inner
+def is_over(values: Array, count: int, limit: float) -> bool:
+    """Whether `ring_level` of a plane's samples is over a limit, without sorting: all but a quarter of them are."""
+    low = 0
+    for k in range(count):
+        low += values[k] <= limit
     return low <= count // 4 and count > 0
 
 
-@njit(error_model="numpy")
+@inner
+def ring_level(values: Array, count: int) -> float:
+    """Mean of the second quarter of a plane's samples on a circle, which are sorted; 0 if there are none.
+
+    So nearly half of the circle may lie on something brighter.
+    """
+    if count == 0:
+        return 0.0
+    for k in range(1, count):
+        insert(values, k, values[k])
+    return mean(values, count // 4, count // 2 + 1)
+
+
+@inner
+def mean(values: Array, first: int, last: int) -> float:
+    """Mean of some of the values."""
+    total = 0.0
+    for k in range(first, last):
+        total += values[k]
+    return total / (last - first)
+
+
+@inner
 def log_lens_over_bad_pixel(
-    image: Image, planes: int, scale: float, v: int, u: int, radius: float, share: float, noise: float
+    picture: Picture, v: int, u: int, radius: float, share: float, noise: float, values: Array
 ) -> float:
     """Log likelihood ratio of a spot that a lens has drawn over a bad pixel, from the eight pixels around a peak.
 
     They hold `share` of its height on the average, or nothing, over the ring of `radius`; each counts by its own plane.
     """
-    if min(u, v) < 1 or u + 1 >= image.shape[1] or v + 1 >= len(image):
+    if min(u, v) < 1 or u + 1 >= picture.width or v + 1 >= picture.height:
         return np.inf
-    ground = np.zeros(4)
-    for p in range(planes):
-        ground[p] = ring_mean(image, planes, scale, p, v, u, radius)
+    count = ring(picture, v, u, radius, values)
+    for p in range(picture.planes):
+        values[p, 0] = ring_level(values[p], count)
     around, height = 0.0, 0.0
     for y in range(v - 1, v + 2):
         for x in range(u - 1, u + 2):
-            over = scale * image[y, x, 0] - ground[((y & 1) * 2 + (x & 1)) if planes == 4 else 0]
+            p = ((y & 1) * 2 + (x & 1)) if picture.planes == 4 else 0
+            over = picture.scale * value(picture, y, x) - values[p, 0]
             if y == v and x == u:
                 height = over
             else:
@@ -93,18 +134,9 @@ def log_lens_over_bad_pixel(
     return held * (around - 0.5 * held) * 8.0 / noise**2
 
 
-@njit(error_model="numpy")
+@inner
 def stands_out(
-    image: Image,
-    planes: int,
-    scale: float,
-    p: int,
-    v: int,
-    u: int,
-    radius: float,
-    noise: float,
-    least: float,
-    small: bool,
+    picture: Picture, p: int, v: int, u: int, radius: float, noise: float, least: float, small: bool, values: Array
 ) -> bool:
     """Whether 3 x 3 samples clear a ring by `least` times the noise: cheap enough for every candidate.
 
@@ -112,110 +144,113 @@ def stands_out(
     Nothing stands out that has lost too little on the ring of what it has lost at twice the radius: the top of a halo
     falls off as the square of the distance, and a spot not larger than the ring has lost half of its height there.
     """
-    level, spread, whole = _pair_level(image, planes, scale, p, v, u, radius)
+    level, spread, whole = _pair_level(picture, p, v, u, radius, values)
     if not whole:
         return True
-    core = core_mean(image, planes, scale, p, v, u)
+    core = core_mean(picture, p, v, u)
     if core - level < least * max(noise, spread if small else 0.0):
         return False
-    far, _, whole = _pair_level(image, planes, scale, p, v, u, 2.0 * radius)
+    far, _, whole = _pair_level(picture, p, v, u, 2.0 * radius, values)
     return not whole or core - level + _SLACK * noise >= _LEAST_LOST * (core - far)
 
 
-@njit(error_model="numpy")
+@inner
 def _pair_level(
-    image: Image, planes: int, scale: float, p: int, v: int, u: int, radius: float
+    picture: Picture, p: int, v: int, u: int, radius: float, means: Array
 ) -> tuple[float, float, bool]:
     """Level and scatter of the means of opposite samples on a ring, which no slope moves; whether it is in view."""
-    means, count = np.empty(RING // 4), 0
-    for k in range(0, RING // 2, 2):
-        x, y = int(np.floor(radius * COS[k] + 0.5)), int(np.floor(radius * SIN[k] + 0.5))
-        if min(u - abs(x), v - abs(y)) < 0 or u + abs(x) >= image.shape[1] or v + abs(y) >= image.shape[0]:
-            return 0.0, 0.0, False
-        both = sample(image, planes, p, v + y, u + x) + sample(image, planes, p, v - y, u - x)
-        count = insert(means, count, 0.5 * scale * both)
-    return means[1:5].mean(), _ROOT_TWO * (means[4] - means[1]) / 1.35, True
+    reach = int(radius + 0.5)
+    if min(u, v) < reach or u + reach >= picture.width or v + reach >= picture.height:
+        return 0.0, 0.0, False
+    for k in range(RING // 4):
+        x, y = int(np.floor(radius * COS[2 * k] + 0.5)), int(np.floor(radius * SIN[2 * k] + 0.5))
+        both = sample(picture, p, v + y, u + x) + sample(picture, p, v - y, u - x)
+        insert(means, k, 0.5 * both)
+    return mean(means, 1, 5), _ROOT_TWO * (means[4] - means[1]) / 1.35, True
 
 
-@njit(error_model="numpy")
-def weigh(image: Image, planes: int, scale: float, v: int, u: int, radius: float, weight: Array) -> None:
+@inner
+def weigh(picture: Picture, v: int, u: int, radius: float, weight: Array, values: Array) -> None:
     """Write each plane's `weight` (4,), their sum 1, for a light of about `radius` px at a pixel.
 
     Planes count by how far they stand out of a ring, as in the best filter for equal noise.
     """
     weight[:] = 0.0
-    if planes == 1:
+    if picture.planes == 1:
         weight[0] = 1.0
         return
-    for p in range(planes):
-        dark = ring_mean(image, planes, scale, p, v, u, 3.0 * radius)
-        weight[p] = max(core_mean(image, planes, scale, p, v, u) - dark, 0.0)
-    total = weight.sum()
-    if total <= 0.0:
-        weight[:planes], total = 1.0, float(planes)
-    weight /= total
+    count, total = ring(picture, v, u, 3.0 * radius, values), 0.0
+    for p in range(picture.planes):
+        weight[p] = max(core_mean(picture, p, v, u) - ring_level(values[p], count), 0.0)
+        total += weight[p]
+    for p in range(picture.planes):
+        weight[p] = weight[p] / total if total > 0.0 else 1.0 / picture.planes
 
 
-@njit(error_model="numpy")
+@inner
 def weigh_clipped(
-    image: Image, planes: int, scale: float, v: int, u: int, least: float, largest: float, weight: Array
+    picture: Picture, v: int, u: int, least: float, largest: float, weight: Array, values: Array
 ) -> float:
     """The same for a saturated light: only the planes in which it is smallest count. Returns its radius there, or 0.
 
     A saturated core in its halo is small where its colour is weak: the red of a blue lamp. The radius is that of the
-    first ring at half height over the ring three times as wide; a plane must stand out by `least`.
+    first ring at half height over the ring three times as wide; a plane must stand out by `least`. `values` (8, 24):
+    scratch.
     """
+    near, far, tops = values[:4], values[4:8], values[:, 12]
+    for p in range(picture.planes):
+        tops[p] = core_mean(picture, p, v, u)
     weight[:] = 0.0
-    radii, most = np.full(4, np.inf), largest
-    for p in range(planes - 1, -1, -1):
-        top, radius = core_mean(image, planes, scale, p, v, u), 3.0
-        if top < least:
-            continue
-        while radius < most:
-            # else it is over half height whatever the background, or the background is too bright
-            if not (
-                _ring_is_over(image, planes, scale, p, v, u, radius, top - 0.5 * least)
-                or _ring_is_over(image, planes, scale, p, v, u, 3.0 * radius, top - least)
-            ):
-                here = ring_mean(image, planes, scale, p, v, u, radius)
-                dark = ring_mean(image, planes, scale, p, v, u, 3.0 * radius)
-                if here <= top - 0.5 * least and top - dark >= least and here <= 0.5 * (top + dark):
-                    radii[p], most = radius, min(1.3 * radius + 1e-6, most)
-                    break
-            radius *= 1.25
-    smallest = radii.min()
-    if not np.isfinite(smallest):
-        return 0.0
-    for p in range(planes):
-        weight[p] = 1.0 if radii[p] <= 1.3 * smallest else 0.0
-    weight /= weight.sum()
-    return float(smallest)
+    radius, smallest, most, alike = 3.0, 0.0, largest, 0
+    while radius < most:
+        count, beyond = ring(picture, v, u, radius, near), -1
+        for p in range(picture.planes):
+            top = tops[p]
+            if weight[p] > 0.0 or top < least or is_over(near[p], count, top - 0.5 * least):
+                continue
+            if beyond < 0:
+                beyond = ring(picture, v, u, 3.0 * radius, far)
+            if is_over(far[p], beyond, top - least):  # the background is too bright, or a part of the light
+                continue
+            here, dark = ring_level(near[p], count), ring_level(far[p], beyond)
+            if here <= top - 0.5 * least and top - dark >= least and here <= 0.5 * (top + dark):
+                weight[p] = 1.0
+                if alike == 0:
+                    smallest, most = radius, min(1.3 * radius + 1e-6, most)
+                alike += 1
+        radius *= 1.25
+    for p in range(picture.planes):
+        weight[p] /= max(alike, 1)
+    return smallest
 
 
-@njit(error_model="numpy")
+@inner
 def square(weight: Array) -> float:
     """Sum of the squares of the planes' weights (4,)."""
-    total = 0.0
-    for p in range(4):
-        total += weight[p] * weight[p]
-    return total
+    return weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2 + weight[3] ** 2
 
 
-@njit(error_model="numpy")
-def mean_by_square(weight: Array, values: Array) -> float:
-    """Mean of the planes' `values` (4,) by the squares of their weights."""
+@inner
+def mean_by_square(weight: Array, values: Array, power: int) -> float:
+    """Mean of a power of the planes' `values` (4,) by the squares of their weights."""
     total = 0.0
     for p in range(4):
-        total += weight[p] * weight[p] * values[p]
+        total += weight[p] * weight[p] * values[p] ** power
     return total / square(weight)
 
 
-@njit(error_model="numpy")
-def insert(ordered: Array, count: int, value: float) -> int:
+@inner
+def insert(ordered: Array, count: int, new: float) -> int:
     """Insert into the first `count` of the sorted values; returns the new count."""
     k = count
-    while k > 0 and ordered[k - 1] > value:
+    while k > 0 and ordered[k - 1] > new:
         ordered[k] = ordered[k - 1]
         k -= 1
-    ordered[k] = value
+    ordered[k] = new
     return count + 1
+
+
+@inner
+def largest(values: Array) -> float:
+    """The largest of the planes' `values` (4,)."""
+    return max(max(values[0], values[1]), max(values[2], values[3]))

@@ -8,10 +8,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from lumidock._kernels import constant, fields
+from lumidock._kernels import constant, fields, inner
 from lumidock.datatypes import Array, Image, Indices
 
 TILE_PX, BLOCK = 8, 8  # pixels a side of a tile, tiles a side of a block
@@ -25,7 +24,9 @@ class Map(NamedTuple):
 
     `peak` (P, h, w) largest values of the tiles; of the blocks `raw_level` (P, hb, wb), `raw_sigma` (hb, wb) and
     `by_plane` (2, P, hb, wb / 4), see `survey`; from these `level`, `sigma`, `spread` (P,) and `shared` (4,), see
-    `settle`. Scratch: `line` (3, n), n = 8 w times the channels; `seen` (h, w); `found` (N, 5).
+    `settle`. Scratch: `line` (3, n) bytes, n = 8 w times those of a pixel; `difference` (2, 8 w times the channels);
+    `middle` (9, w) and `ordered` (hb wb + 4,); `least` (2, w) and `worth` (8 w,) of a row of tiles; `seen` (h, w); `found`
+    (N, 5) and `queue` (2, N).
     """
 
     peak: Image
@@ -37,12 +38,20 @@ class Map(NamedTuple):
     spread: Array
     shared: Array
     line: Image
+    difference: NDArray[np.int32]
+    middle: Image
+    ordered: Array
+    least: NDArray[np.int32]
+    worth: Image
     seen: Image
     found: Array
+    queue: Array
 
 
-@njit(error_model="numpy")
-def refresh(rows: Image, planes: int, rect: Indices, step: int, peak: Image, line: Image) -> None:
+@inner
+def refresh(
+    rows: Image, planes: int, rect: tuple[int, int, int, int], step: int, peak: Image, line: Image
+) -> None:
     """Write the largest values of each tile of `rect` into `peak` (P, h, w); `rect` is two rows and two columns.
 
     One map for mono; for `planes` 3 one for each channel; for a mosaic, `planes` 4, the corners of its 2 x 2 cell that
@@ -79,13 +88,13 @@ def refresh(rows: Image, planes: int, rect: Indices, step: int, peak: Image, lin
             _largest_of_wide_tiles(even, most, peak, i, rect[2])
 
 
-@njit(error_model="numpy")
+@inner
 def _row(rows: Image, top: int, k: int) -> int:
     """Row `k` of a tile, or one of its own kind where the picture ends before it."""
     return top + k if top + k < len(rows) else top + (k & 1 if top + 1 < len(rows) else 0)
 
 
-@njit(error_model="numpy")
+@inner
 def _max_of_eight(rows: Image, top: int, left: int, line: Image) -> None:
     right = left + len(line)
     a, b = rows[top, left:right], rows[_row(rows, top, 1), left:right]
@@ -96,7 +105,7 @@ def _max_of_eight(rows: Image, top: int, left: int, line: Image) -> None:
         line[x] = max(max(max(a[x], b[x]), max(c[x], d[x])), max(max(e[x], f[x]), max(g[x], h[x])))
 
 
-@njit(error_model="numpy")
+@inner
 def _max_of_four(rows: Image, top: int, first: int, step: int, left: int, line: Image) -> None:
     """The larger of every second row of a tile from `first` on; of every fourth with `step` 2."""
     right = left + len(line)
@@ -110,7 +119,7 @@ def _max_of_four(rows: Image, top: int, first: int, step: int, left: int, line: 
         line[x] = max(max(a[x], b[x]), max(c[x], d[x]))
 
 
-@njit(error_model="numpy")
+@inner
 def _largest_of_tiles(line: Image, out: Image) -> None:
     for j in range(len(out)):
         largest = line[TILE_PX * j]
@@ -119,7 +128,7 @@ def _largest_of_tiles(line: Image, out: Image) -> None:
         out[j] = largest
 
 
-@njit(error_model="numpy")
+@inner
 def _largest_of_corner(line: Image, first: int, out: Image) -> None:
     """The largest of every second value of each tile."""
     for j in range(len(out)):
@@ -127,7 +136,7 @@ def _largest_of_corner(line: Image, first: int, out: Image) -> None:
         out[j] = max(max(line[x], line[x + 2]), max(line[x + 4], line[x + 6]))
 
 
-@njit(error_model="numpy")
+@inner
 def _largest_of_wide_tiles(line: Image, most: Image, peak: Image, i: int, left: int) -> None:
     """The same for three channels: the largest of eight pixels from each value on, in one run, then those of tiles."""
     n = len(line) - 21
@@ -143,28 +152,31 @@ def _largest_of_wide_tiles(line: Image, most: Image, peak: Image, i: int, left: 
         a[j], b[j], c[j] = most[x], most[x + 1], most[x + 2]
 
 
-@njit(error_model="numpy")
-def survey(rows: Image, planes: int, blocks: tuple[int, int], step: int, known: Map) -> None:
-    """Bring the rows of blocks from `blocks[0]` to `blocks[1]` up to date, by every `step`th row of pixels.
+@inner
+def look(
+    rows: Image, line: Image, planes: int, blocks: tuple[int, int], step: int, rects: Indices, count: int, known: Map
+) -> None:
+    """Bring the rows of blocks from `blocks[0]` to `blocks[1]` up to date, and the first `count` windows `rects`.
 
-    That is `peak` of their tiles, and of blocks `raw_level`, the median of their tiles, `raw_sigma`, the noise of a
-    sample, and `by_plane`, the noise of each plane, and what the sums of eight neighbours make of it over the root of
-    eight: demosaicing and JPEG share noise. One row of pixels speaks for a row of blocks, by second differences, which
-    no slope reaches, of every other pixel, which a mosaic does not.
+    Of the rows of blocks by every `step`th row of pixels: `peak` of their tiles, and of blocks `raw_level`, the median
+    of their tiles, `raw_sigma`, the noise of a sample, and `by_plane`, the noise of each plane, and what the sums of
+    eight neighbours make of it over the root of eight: demosaicing and JPEG share noise. One row of pixels speaks for a
+    row of blocks, by second differences, which no slope reaches, of every other pixel, which a mosaic does not. `line`:
+    scratch in the type of `rows`, see `Map`.
     """
     peak = known.peak
-    rect = np.array([0, 0, 0, peak.shape[2]])
-    difference = np.empty((2, rows.shape[1]), np.int32)
+    h, w = peak.shape[1:]
     for b in range(blocks[0], blocks[1]):
-        rect[0], rect[1] = b * BLOCK, min((b + 1) * BLOCK, peak.shape[1])
-        refresh(rows, planes, rect, step, peak, known.line)
+        refresh(rows, planes, (b * BLOCK, min((b + 1) * BLOCK, h), 0, w), step, peak, line)
         for p in range(len(peak)):
-            _levels(peak[p], b, known.raw_level[p])
+            _levels(peak[p], b, known.raw_level[p], known.middle)
         v = min(b * BLOCK * TILE_PX + 3 * TILE_PX, (len(rows) - 2) & -2)
-        _noise(rows[v], rows[v + 1], planes, difference, known.raw_sigma[b], known.by_plane[:, :, b])
+        _noise(rows[v], rows[v + 1], planes, known.difference, known.raw_sigma[b], known.by_plane[:, :, b])
+    for k in range(count):
+        refresh(rows, planes, (rects[k, 0], rects[k, 1], rects[k, 2], rects[k, 3]), EVERY, peak, line)
 
 
-@njit(error_model="numpy")
+@inner
 def clear(seen: Image, rects: Indices) -> None:
     """Forget that tiles of some windows `rects` (n, 4) were seen."""
     for k in range(len(rects)):
@@ -172,7 +184,7 @@ def clear(seen: Image, rects: Indices) -> None:
             seen[i, rects[k, 2] : rects[k, 3]] = 0
 
 
-@njit(error_model="numpy")
+@inner
 def windows(expected: Array, before: Array, drift_px: float, h: int, w: int, rects: Indices) -> int:
     """Write the tiles, `rects` (n, 4), around the `expected` places (n, 3), u, v and reach px, and the spots `before`.
 
@@ -199,12 +211,12 @@ def windows(expected: Array, before: Array, drift_px: float, h: int, w: int, rec
     return count
 
 
-@njit(error_model="numpy")
+@inner
 def _clip(x: float, most: int) -> int:
     return int(min(max(x, 0.0), float(most)))
 
 
-@njit(error_model="numpy")
+@inner
 def area(rects: Indices) -> int:
     """Tiles in all windows together, those in several counted as often."""
     total = 0
@@ -213,7 +225,7 @@ def area(rects: Indices) -> int:
     return total
 
 
-@njit(error_model="numpy")
+@inner
 def _noise(even: Image, odd: Image, planes: int, difference: NDArray[np.int32], sigma: Array, by_plane: Array) -> None:
     """The noise of one row of blocks, from an even and, of a mosaic, an odd row of pixels, see `survey`.
 
@@ -240,7 +252,7 @@ def _noise(even: Image, odd: Image, planes: int, difference: NDArray[np.int32], 
             by_plane[0, p, k // SPARSE] = _SIGMA * own
 
 
-@njit(error_model="numpy")
+@inner
 def _second_differences(row: Image, step: int, out: NDArray[np.int32]) -> None:
     """Absolute second differences of samples `step` apart."""
     n = max(len(row) - 2 * step, 0)
@@ -249,7 +261,7 @@ def _second_differences(row: Image, step: int, out: NDArray[np.int32]) -> None:
         d[x] = abs(np.int32(a[x]) - np.int32(2) * np.int32(b[x]) + np.int32(c[x]))
 
 
-@njit(error_model="numpy")
+@inner
 def _mean(values: NDArray[np.int32], first: int, last: int, step: int) -> float:
     """Mean of every so many of `values`, 0 where there are none."""
     part = values[first : max(last, first)]
@@ -263,7 +275,7 @@ def _mean(values: NDArray[np.int32], first: int, last: int, step: int) -> float:
     return total / max((len(part) + step - 1) // step, 1)
 
 
-@njit(error_model="numpy")
+@inner
 def settle(known: Map, least: float, most: float) -> None:
     """Write what a frame's blocks say together.
 
@@ -272,19 +284,19 @@ def settle(known: Map, least: float, most: float) -> None:
     """
     level, sigma, spread, shared, by_plane = known.level, known.sigma, known.spread, known.shared, known.by_plane
     for p in range(len(level)):
-        _smoothed(known.raw_level[p], level[p])
-    _smoothed(known.raw_sigma, sigma)
+        _smoothed(known.raw_level[p], level[p], known.ordered)
+    _smoothed(known.raw_sigma, sigma, known.ordered)
     for i in range(sigma.shape[0]):
         for j in range(sigma.shape[1]):
             sigma[i, j] = max(sigma[i, j], least)
-    typical = np.median(sigma[::2, ::2].copy())
+    typical = _median(sigma[::2, ::2], known.ordered)
     for p in range(len(level)):
-        own = np.median(by_plane[0, p].copy())
+        own = _median(by_plane[0, p], known.ordered)
         spread[p] = min(max(own / typical, 0.3, least / typical), 3.0)  # less than a step of the sensor is none
-        shared[p] = min(max((np.median(by_plane[1, p].copy()) / max(own, 0.7 * least)) ** 2, 1.0), most)
+        shared[p] = min(max((_median(by_plane[1, p], known.ordered) / max(own, 0.7 * least)) ** 2, 1.0), most)
 
 
-@njit(error_model="numpy")
+@inner
 def _second_difference_of_sums(row: Image) -> float:
     """The same of sums of `TILE_PX` neighbours, over the root of their number."""
     count = len(row) // TILE_PX
@@ -301,46 +313,88 @@ def _second_difference_of_sums(row: Image) -> float:
     return total / ((count - 2) * np.sqrt(TILE_PX))
 
 
-@njit(error_model="numpy")
-def _levels(peak: Image, b: int, level: Image) -> None:
+@inner
+def _median(values: Array, ordered: Array) -> float:
+    """The upper median of `values` (m, n), which are put into `ordered`."""
+    count = 0
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            ordered[count] = values[i, j]
+            count += 1
+    return float(select(ordered, count, count // 2))
+
+
+@inner
+def select(values: Array, count: int, k: int) -> float:
+    """The value that would be at `k` if the first `count` were sorted; they change places (Hoare's selection)."""
+    low, high = 0, count - 1
+    while low < high:
+        pivot, i, j = values[(low + high) // 2], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        if k <= j:
+            high = j
+        elif k >= i:
+            low = i
+        else:
+            break
+    return float(values[k])
+
+
+@inner
+def _levels(peak: Image, b: int, level: Image, middle: Image) -> None:
     """Write the median of the tiles of each block of one row of blocks, row by row and then of those, to `level[b]`."""
     h, w = peak.shape
-    i = b * BLOCK
-    columns, rows = np.empty(w, peak.dtype), np.empty((BLOCK, level.shape[1]), peak.dtype)
-    if i + BLOCK <= h:
-        _middle_of_eight(peak[i : i + BLOCK], columns)
-    else:
-        last = np.empty((BLOCK, w), peak.dtype)
-        for k in range(BLOCK):
-            last[k] = peak[min(i + k, h - 1)]
-        _middle_of_eight(last, columns)
-    for j in range(level.shape[1]):
-        for k in range(BLOCK):
-            rows[k, j] = columns[min(j * BLOCK + k, w - 1)]
-    _middle_of_eight(rows, level[b])
+    i, last, columns = b * BLOCK, h - 1, middle[BLOCK, :w]
+    _middle_of_eight(
+        peak[i],
+        peak[min(i + 1, last)],
+        peak[min(i + 2, last)],
+        peak[min(i + 3, last)],
+        peak[min(i + 4, last)],
+        peak[min(i + 5, last)],
+        peak[min(i + 6, last)],
+        peak[min(i + 7, last)],
+        columns,
+    )
+    for k in range(BLOCK):
+        for j in range(level.shape[1]):
+            middle[k, j] = columns[min(j * BLOCK + k, w - 1)]
+    r = middle
+    _middle_of_eight(r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], level[b])
 
 
-@njit(error_model="numpy")
-def _middle_of_eight(r: Image, out: Image) -> None:
-    """Write the fifth smallest of each column of `r` (8, n) to `out`: of two sorted halves."""
+@inner
+def _middle_of_eight(
+    a: Image, b: Image, c: Image, d: Image, e: Image, f: Image, g: Image, h: Image, out: Image
+) -> None:
+    """Write the fifth smallest of each column of eight rows to `out`: of two sorted halves."""
     for x in range(len(out)):
-        a, b, c, d = _sorted_four(r[0, x], r[1, x], r[2, x], r[3, x])
-        e, f, g, h = _sorted_four(r[4, x], r[5, x], r[6, x], r[7, x])
-        out[x] = min(min(max(a, h), max(b, g)), min(max(c, f), max(d, e)))
+        i, j, k, m = _sorted_four(a[x], b[x], c[x], d[x])
+        p, q, r, s = _sorted_four(e[x], f[x], g[x], h[x])
+        out[x] = min(min(max(i, s), max(j, r)), min(max(k, q), max(m, p)))
 
 
-@njit(error_model="numpy")
+@inner
 def _sorted_four(a: float, b: float, c: float, d: float) -> tuple[float, float, float, float]:
     a, b, c, d = min(a, b), max(a, b), min(c, d), max(c, d)
     a, c, b, d = min(a, c), max(a, c), min(b, d), max(b, d)
     return a, min(b, c), max(b, c), d
 
 
-@njit(error_model="numpy")
-def _smoothed(values: Array, out: Array) -> None:
-    """Write the median of five columns of the medians of five rows around each of `values` (h, w) to `out`."""
+@inner
+def _smoothed(values: Array, out: Array, middle: Array) -> None:
+    """Write the median of five columns of the medians of five rows around each of `values` (h, w) to `out`.
+
+    `middle`: scratch, four longer than a row.
+    """
     h, w = values.shape
-    middle = np.empty(w + 4, np.float32)
     for i in range(h):
         a, b = values[max(i - 2, 0)], values[max(i - 1, 0)]
         c, d, e = values[i], values[min(i + 1, h - 1)], values[min(i + 2, h - 1)]
@@ -352,7 +406,7 @@ def _smoothed(values: Array, out: Array) -> None:
             row[j] = _median_of_five(middle[j], middle[j + 1], middle[j + 2], middle[j + 3], middle[j + 4])
 
 
-@njit(error_model="numpy")
+@inner
 def _median_of_five(a: float, b: float, c: float, d: float, e: float) -> float:
     f, g = max(min(a, b), min(c, d)), min(max(a, b), max(c, d))
     return max(min(f, g), min(max(f, g), e))
