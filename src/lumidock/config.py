@@ -161,6 +161,8 @@ class DetectConfig(Section):
     prominent: Fraction = 0.1  # of the brightest; for spots with more flux a crowd says nothing
     kin: PositiveFloat = 3.0  # spots are of a kind whose fluxes are within this factor
     flux_range: PositiveFloat = 300.0  # of the lamps in one view; a spot fainter than that by the brightest is none
+    memory_s: PositiveFloat = 0.25  # an older frame says nothing of which spots are steady
+    drift_px_s: PositiveFloat = 400.0  # a lamp moves no faster over the picture, or counts as new
 
 
 class LabelConfig(Section):

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from lumidock._kernels import constant, fields, patch, peaks, tiles
-from lumidock._kernels.likelihood import dim_glints, dim_small_fry, lamp_probability
+from lumidock._kernels.likelihood import dim_glints, dim_small_fry, lamp_probability, weigh_steadiness
 from lumidock._kernels.measure import measure
 from lumidock.datatypes import Array, Image, Indices
 
@@ -32,6 +32,7 @@ def see(
     part: int,
     expected: Array,
     before: int,
+    since: tuple[float, bool],
     most: tuple[int, int],
     q: Array,
     spots: Array,
@@ -40,12 +41,13 @@ def see(
 
     `image` (H, W, C); `planes` 1, 3 or, for a mosaic, 4; `scale` makes 8-bit levels of its samples. Looked at is all of
     it, with `part` -1; else the tiles around the `expected` places (n, 3) u, v, reach px, and around the spots of the
-    frame before, which are the first `before` in `spots`, and the `part` of `SWEEP` of the rest. `most`: candidates and
-    measurements. Returns how many spots there are, and whether all was looked at, as where windows are much of it.
+    frame before, which are the first `before` in `spots`, and the `part` of `SWEEP` of the rest. `since` that frame a lamp
+    has moved no farther than so many px (0: nothing is known of it), and it was all looked at, or not. `most`:
+    candidates and measurements. Returns how many spots there are, and whether all was looked at, as where windows are much of it.
     """
     rows, (h, w), blocks = image.reshape(len(image), -1), known.peak.shape[1:], len(known.sigma)
     rects = np.empty((len(expected) + before + 1, 4), np.int64)
-    count, whole = 0, part < 0
+    count, whole, past = 0, part < 0, spots[:before, : fields.FLUX + 1].copy()
     first, last = part * blocks // SWEEP, (part + 1) * blocks // SWEEP
     if not whole:
         count = tiles.windows(expected, spots[:before], _DRIFT_PX, h, w, rects)
@@ -60,7 +62,7 @@ def see(
         tiles.refresh(rows, planes, rects[k], tiles.EVERY, known.peak, known.line)
     if whole or part == SWEEP - 1:
         tiles.settle(known, q[fields.MIN_NOISE] / scale, 1.0 if planes == 4 else _MOST_SHARED)
-    return _search(image, planes, scale, known, rects[: count + 1], most, q, spots), whole
+    return _search(image, planes, scale, known, rects[: count + 1], past, since, most, q, spots), whole
 
 
 @njit(inline="always", error_model="numpy")
@@ -70,6 +72,8 @@ def _search(
     scale: float,
     known: tiles.Map,
     rects: Indices,
+    past: Array,
+    since: tuple[float, bool],
     most: tuple[int, int],
     q: Array,
     spots: Array,
@@ -134,6 +138,8 @@ def _search(
         n += status > 0
     for k in range(n):
         spots[k, fields.P_LIGHT] = lamp_probability(spots[k], q)
+    if since[0] > 0.0:
+        weigh_steadiness(spots, n, past, *since)
     dim_glints(spots, n, q)
     dim_small_fry(spots, n, q)
     return n
