@@ -14,6 +14,7 @@ LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out
 _MAX_TILES = 20  # a light is not wider
 _ROUNDS = 4
 _ONLY_MARK = constant(1)
+_TOO_WIDE = 0.75  # of the largest radius: nobody would believe it
 _QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth having clears 1.8
 # share of a peak's height that a lens that blurs by 0.65 px, 1 sigma, gives the pixels around it; on a mosaic those of
 # other colours get a quarter of it from a lamp of one colour
@@ -97,6 +98,9 @@ def measure(
             break
         reach = wanted
     if part == 0.0:
+        return 0
+    if np.sqrt(sums[patch.N] / np.pi) * where[patch.UNIT] > _TOO_WIDE * q[fields.MAX_RADIUS_PX]:  # lights may be in its halo
+        _own_plateau(image, planes, scale, weight, v, u, reach, q, window, where, start, seen)
         return 0
     _own(seen, window, where, start)
     ground[4] = samples.mean_by_square(weight, shared_by_plane**2)
@@ -234,16 +238,23 @@ def _own_plateau(
     start: Indices,
     seen: Image,
 ) -> None:
-    """Mark the tiles of what is too large to be a light, as far as it is as bright as here in its weakest plane."""
-    darkest, least = 0, 1e9
+    """Mark the tiles of what is too large to be a light, as far as it is as bright as here in every plane."""
+    darkest, bright = 0, np.zeros(4)
     for p in range(planes):
-        mean = samples.core_mean(image, planes, scale, p, v, u)
-        if mean <= least:
-            darkest, least = p, mean
+        bright[p] = LEVELS[-1] * samples.core_mean(image, planes, scale, p, v, u)
+        if bright[p] <= bright[darkest]:
+            darkest = p
     weight[:] = 0.0
     weight[darkest] = 1.0
     patch.cut(image, planes, scale, weight, v, u, reach, patch.COARSE_SIDE, window[0], where)
     start[0], start[1] = index(u, where[0], where[2], where[3]), index(v, where[1], where[2], where[4])
-    window[1][:] = 0
-    patch.grow(window, where, image, start[0], start[1], LEVELS[-1] * least, q[fields.CLIPPED], _ONLY_MARK)
+    stamp, sums, unit = window[1], window[3], int(where[patch.UNIT])
+    stamp[:] = 0
+    patch.grow(window, where, image, start[0], start[1], bright[darkest], q[fields.CLIPPED], _ONLY_MARK)
+    for i in range(int(sums[patch.FIRST_ROW]), int(sums[patch.LAST_ROW]) + 1):
+        for j in range(int(sums[patch.FIRST_COLUMN]), int(sums[patch.LAST_COLUMN]) + 1):
+            y, x = int(where[patch.TOP]) + i * unit, int(where[patch.LEFT]) + j * unit
+            for p in range(planes):
+                if (i != start[1] or j != start[0]) and scale * samples.sample(image, planes, p, y, x) < bright[p]:
+                    stamp[i, j] = 0
     _own(seen, window, where, start)
