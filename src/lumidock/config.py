@@ -172,8 +172,8 @@ class LabelConfig(Section):
     clear_px: PositiveFloat = 3.0  # beyond a saturated core's edge, where clipping and demosaicing make it white
     ring: tuple[PositiveFloat, PositiveFloat] = (1.5, 6.0)  # its colour is read up to this many radii + px
     min_reach_px: PositiveFloat = 2.0  # other spots are read whole, small ones to here
-    blue_ratio: PositiveFloat = 1.0  # blue over the larger of green and red, where both layers are as likely
-    softness: PositiveFloat = 0.15  # of the logarithm of that ratio, without any noise
+    blue_ratio: PositiveFloat = 1.2  # blue over the larger of green and red, where both layers are as likely
+    softness: PositiveFloat = 0.2  # of the logarithm of that ratio, without any noise
     min_signal: PositiveFloat = 3.0  # sigmas of the ring's noise below which nothing is known
     limit: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.03  # p_rear stays this far from 0 and 1
 

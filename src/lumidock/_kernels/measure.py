@@ -14,7 +14,6 @@ LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out
 _MAX_TILES = 20  # a light is not wider
 _ROUNDS = 4
 _ONLY_MARK = constant(1)
-_TOO_WIDE = 0.75  # of the largest radius: nobody would believe it
 _QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth having clears 1.8
 # share of a peak's height that a lens that blurs by 0.65 px, 1 sigma, gives the pixels around it; on a mosaic those of
 # other colours get a quarter of it from a lamp of one colour
@@ -99,7 +98,7 @@ def measure(
         reach = wanted
     if part == 0.0:
         return 0
-    if np.sqrt(sums[patch.N] / np.pi) * where[patch.UNIT] > _TOO_WIDE * q[fields.MAX_RADIUS_PX]:  # lights may be in its halo
+    if np.sqrt(sums[patch.N] / np.pi) * where[patch.UNIT] > q[fields.MAX_RADIUS_PX]:  # lights may stand in its halo
         _own_plateau(image, planes, scale, weight, v, u, reach, q, window, where, start, seen)
         return 0
     _own(seen, window, where, start)
