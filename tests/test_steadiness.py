@@ -47,7 +47,8 @@ def test_a_spot_that_moves_with_the_vehicle_gains_and_a_new_one_loses(way, rng):
     peaks = rng.uniform(12.0, 60.0, 3)
     new = (140.0, 40.0)
     after, alone = film(rng, STEP_NS, (SPOTS, peaks), (np.vstack([SPOTS + way, new]), [*peaks, 60.0]))
-    assert (after[:3] >= alone[:3]).all() and (after[:3] > alone[:3]).any()
+    assert (after[:3] >= alone[:3]).all()
+    assert (after[:3] > alone[:3]).any()
     assert odds(after[3]) < 0.1 * odds(alone[3])
 
 
@@ -68,9 +69,8 @@ def test_a_tracked_search_holds_nothing_against_what_it_did_not_look_at(rng):
     scan = detect.Scan(Frame("0", 0, image), CONFIG)
     detect.lights(Frame("0", 0, picture(rng, SPOTS[:1])), CONFIG, scan)
     expected = np.array([[*SPOTS[0], 12.0]])
-    seen = []
-    for k in range(1, 2 * detect.SWEEP):
-        seen.append(detect.lights(Frame(str(k), k * STEP_NS, image), CONFIG, scan, expected))
+    frames = [Frame(str(k), k * STEP_NS, image) for k in range(1, 2 * detect.SWEEP)]
+    seen = (detect.lights(frame, CONFIG, scan, expected) for frame in frames)
     first = next(found for found in seen if len(found) == len(SPOTS))
     assert (likely(first, SPOTS) > 0.9).all()
 

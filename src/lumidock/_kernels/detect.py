@@ -41,9 +41,10 @@ def see(
 
     `image` (H, W, C); `planes` 1, 3 or, for a mosaic, 4; `scale` makes 8-bit levels of its samples. Looked at is all of
     it, with `part` -1; else the tiles around the `expected` places (n, 3) u, v, reach px, and around the spots of the
-    frame before, which are the first `before` in `spots`, and the `part` of `SWEEP` of the rest. `since` that frame a lamp
-    has moved no farther than so many px (0: nothing is known of it), and it was all looked at, or not. `most`:
-    candidates and measurements. Returns how many spots there are, and whether all was looked at, as where windows are much of it.
+    frame before, which are the first `before` in `spots`, and the `part` of `SWEEP` of the rest. `since`: how far, px,
+    a lamp may have moved since that frame (0: nothing is known of it), and whether it was all looked at. `most`:
+    candidates and measurements. Returns how many spots there are, and whether all was looked at, as where windows are
+    much of it.
     """
     rows, (h, w), blocks = image.reshape(len(image), -1), known.peak.shape[1:], len(known.sigma)
     rects = np.empty((len(expected) + before + 1, 4), np.int64)
