@@ -347,6 +347,15 @@ def test_a_mosaic_tells_blue_from_white(order, rng):
         assert (spots.p_rear[k] > 0.5) == rear
 
 
+def test_clear_water_makes_no_white_light_a_rear_one(rng):
+    image = canvas(rng)
+    add_spot(image, 160.0, 120.0, 120.0, 3.0)
+    linear = (np.clip(image, 0, 255) - 20.0)[:, :, None] * (1.1, 1.0, 0.6) + 20.0  # it has lost red, then green
+    frame = Frame("0", 0, to_picture(255.0 * (np.clip(linear, 0.0, 255.0) / 255.0) ** (1.0 / 2.2)))
+    spots = layers.label(frame, detect.lights(frame, CONFIG), LabelConfig())
+    assert spots.p_rear[spots.flux.argmax()] < 0.5
+
+
 def test_a_dim_blue_light_shows_before_a_brighter_green_background(rng):
     image = np.stack([canvas(rng), canvas(rng, level=60.0), canvas(rng, level=10.0)], axis=2)
     add_spot(image[:, :, 0], 150.3, 120.6, peak=12.0)

@@ -161,6 +161,8 @@ class DetectConfig(Section):
     prominent: Fraction = 0.1  # of the brightest; for spots with more flux a crowd says nothing
     kin: PositiveFloat = 3.0  # spots are of a kind whose fluxes are within this factor
     flux_range: PositiveFloat = 300.0  # of the lamps in one view; a spot fainter than that by the brightest is none
+    memory_s: PositiveFloat = 0.25  # an older frame says nothing of which spots are steady
+    drift_px_s: PositiveFloat = 400.0  # a lamp moves no faster over the picture, or counts as new
 
 
 class LabelConfig(Section):
@@ -170,8 +172,8 @@ class LabelConfig(Section):
     clear_px: PositiveFloat = 3.0  # beyond a saturated core's edge, where clipping and demosaicing make it white
     ring: tuple[PositiveFloat, PositiveFloat] = (1.5, 6.0)  # its colour is read up to this many radii + px
     min_reach_px: PositiveFloat = 2.0  # other spots are read whole, small ones to here
-    blue_ratio: PositiveFloat = 1.0  # blue over the larger of green and red, where both layers are as likely
-    softness: PositiveFloat = 0.15  # of the logarithm of that ratio, without any noise
+    blue_ratio: PositiveFloat = 1.2  # blue over the larger of green and red, where both layers are as likely
+    softness: PositiveFloat = 0.2  # of the logarithm of that ratio, without any noise
     min_signal: PositiveFloat = 3.0  # sigmas of the ring's noise below which nothing is known
     limit: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.03  # p_rear stays this far from 0 and 1
 

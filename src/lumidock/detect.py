@@ -66,11 +66,19 @@ class Scan:
         self.most = (config.max_candidates, config.max_measured)
         self.spots, self.count = np.empty((config.max_spots, fields.COLUMNS)), 0
         self.rects = np.empty((config.max_spots + 1, 4), np.int64)
+        self.past = np.empty((config.max_spots, fields.FLUX + 1))
         self.part = -1  # of SWEEP, whose turn it is; nothing was seen yet
+        self.t_ns: int | None = None
+        self.saw_all = False
 
     def fits(self, frame: Frame) -> bool:
         """Whether a frame is like those that this was made for."""
         return self.like == (frame.image.shape, frame.image.dtype, frame.encoding)
+
+    def since(self, t_ns: int, config: DetectConfig) -> tuple[float, bool]:
+        """How far, px, a lamp may have moved since the frame before, 0 if that is too long ago; whether it saw all."""
+        dt_s = (t_ns - self.t_ns) * 1e-9 if self.t_ns is not None else 0.0
+        return (config.drift_px_s * dt_s if 0.0 < dt_s <= config.memory_s else 0.0), self.saw_all
 
 
 def picture(frame: Frame) -> Picture:
@@ -120,12 +128,14 @@ def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None, expecte
         scan.part,
         expected,
         scan.count,
+        scan.since(frame.t_ns, config),
         scan.most,
         scan.q,
         scan.rects,
+        scan.past,
         scan.spots,
     )
-    scan.part = 0 if whole else (scan.part + 1) % SWEEP
+    scan.t_ns, scan.saw_all, scan.part = frame.t_ns, whole, 0 if whole else (scan.part + 1) % SWEEP
     return _detections(frame, scan.spots[: scan.count])
 
 

@@ -64,6 +64,8 @@ class Localizer:
             raise FrameError("bad_frame", f"frame {frame.name} is {width}x{height}, the calibration {wanted}")
         if self.scan is None or not self.scan.fits(frame):
             self.scan = detect.Scan(frame, self.config.detect)
+        if self.cold:
+            self.scan.t_ns = None
         detections = detect.lights(frame, self.config.detect, self.scan, self.foreseen(frame))
         return self.process_detections(layers.label(frame, detections, self.config.label))
 

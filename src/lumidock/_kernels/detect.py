@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from lumidock._kernels import constant, fields, inlined, inner, peaks, samples, tiles
-from lumidock._kernels.likelihood import dim_glints, dim_small_fry, lamp_probability
+from lumidock._kernels.likelihood import dim_glints, dim_small_fry, lamp_probability, weigh_steadiness
 from lumidock._kernels.measure import measure
 from lumidock._kernels.patch import CloseUp
 from lumidock._kernels.samples import Picture
@@ -35,20 +35,26 @@ def see(
     part: int,
     expected: Array,
     before: int,
+    since: tuple[float, bool],
     most: tuple[int, int],
     q: Array,
     rects: Indices,
+    past: Array,
     spots: Array,
 ) -> tuple[int, bool]:
     """Write the spots of a frame to `spots` (N, COLUMNS), the strongest first.
 
     Looked at is all of the picture, with `part` -1; else the tiles around the `expected` places (n, 3) u, v, reach px,
     and around the spots of the frame before, which are the first `before` in `spots`, and the `part` of `SWEEP` of the
-    rest; `rects` has room for a window each, and one. `most`: candidates and measurements. Returns how many spots there
-    are, and whether all was looked at, as where windows are much of it.
+    rest; `rects` has room for a window each, and one, `past` (N, 4) for the spots before. `since`: how far, px, a lamp
+    may have moved since that frame (0: nothing is known of it), and whether it was all looked at. `most`: candidates
+    and measurements. Returns how many spots there are, and whether all was looked at, as where windows are much of it.
     """
     planes, (h, w), blocks = picture.planes, known.peak.shape[1:], len(known.sigma)
     count, whole = 0, part < 0
+    for k in range(before):
+        for c in range(past.shape[1]):
+            past[k, c] = spots[k, c]
     first, last = part * blocks // SWEEP, (part + 1) * blocks // SWEEP
     if not whole:
         count = tiles.windows(expected, spots[:before], _DRIFT_PX, h, w, rects)
@@ -72,6 +78,8 @@ def see(
     n = _measured(picture, known, close, count, most[1], q, spots)
     for k in range(n):
         spots[k, fields.P_LIGHT] = lamp_probability(spots[k], q)
+    if since[0] > 0.0:
+        weigh_steadiness(spots, n, past[:before], since[0], since[1])
     dim_glints(spots, n, q, known.queue[0])
     dim_small_fry(spots, n, q, known.queue[0])
     return n, whole

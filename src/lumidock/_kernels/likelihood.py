@@ -8,13 +8,17 @@ from lumidock._kernels import fields, inner
 from lumidock.datatypes import Array
 
 _LOG_BAD_PIXEL = -2.3  # prior log odds that a small spot is a bad pixel
+_USUAL_SNR = 8.5  # at which half of the lamps are found
+_STEADY = 5.0  # odds of a lamp for a spot that was there before: nearly all lamps were, one in five of the rest
+_STEADY_FLUX = 0.3  # 1 sigma of the logarithm of a lamp's flux from frame to frame
+_APPEARS, _NEW = 0.05, 0.7  # share of the lamps, and of all else, that were not there in the frame before
 
 
 @inner
 def lamp_probability(spot: Array, q: Array) -> float:
     """Probability of being a lamp, from contrast, shape, size and blur: soft, so that geometry can overrule it."""
     radius = spot[fields.RADIUS]
-    seen = _logistic(spot[fields.SNR] - 8.5)
+    seen = _logistic(spot[fields.SNR] - _USUAL_SNR)
     small = np.exp(-radius / 3.0)  # the outline of a small spot says little of its shape
     round_ = _logistic((spot[fields.ELONGATION] - 0.5) / 0.06)
     full = _logistic((spot[fields.FILL] - 0.75) / 0.04)
@@ -30,6 +34,26 @@ def lamp_probability(spot: Array, q: Array) -> float:
 @inner
 def _logistic(x: float) -> float:
     return float(1.0 / (1.0 + np.exp(-x)))
+
+
+@inner
+def weigh_steadiness(spots: Array, n: int, past: Array, reach_px: float, saw_all: bool) -> None:
+    """Make more of spots that were there in the frame before, and less of those that were not if it was all looked at.
+
+    `past` (m, 4): its spots; only of one within `reach_px` and of much the same flux is a spot the continuation. A
+    faint lamp may have been missed.
+    """
+    for k in range(n):
+        steady = 0.0
+        for m in range(len(past)):
+            du, dv = spots[k, fields.U] - past[m, fields.U], spots[k, fields.V] - past[m, fields.V]
+            if abs(du) < reach_px and abs(dv) < reach_px and min(spots[k, fields.FLUX], past[m, fields.FLUX]) > 0.0:
+                change = np.log(spots[k, fields.FLUX] / past[m, fields.FLUX]) / _STEADY_FLUX
+                steady = max(steady, np.exp(-0.5 * change * change))
+        missed = max(1.0 - _logistic(spots[k, fields.SNR] - _USUAL_SNR), _APPEARS)
+        new = min(missed / _NEW, 1.0) if saw_all else 1.0
+        odds = (new + (_STEADY - new) * steady) * spots[k, fields.P_LIGHT] / (1.0 - spots[k, fields.P_LIGHT])
+        spots[k, fields.P_LIGHT] = min(max(odds / (1.0 + odds), 0.02), 0.98)
 
 
 @inner
@@ -49,9 +73,10 @@ def dim_glints(spots: Array, n: int, q: Array, before: Array) -> None:
                 spots[m, fields.FLUX] > q[fields.GLINT_RATIO] * spots[k, fields.FLUX]
                 and spots[m, fields.CORE] > 0.9 * spots[k, fields.CORE]
             )
-            halo = m < k and spots[k, fields.SATURATED] > 0.0 and spots[k, fields.CORE] < 0.9 * spots[m, fields.CORE]
+            halo = m < k and spots[k, fields.CORE] < 0.9 * spots[m, fields.CORE]
+            halo &= spots[k, fields.SATURATED] > 0.0 or np.hypot(du, dv) < spots[k, fields.RADIUS]
             if m != k and near and (weaker or halo) and before[m] > q[fields.GLINT_TRUST] * before[k]:
-                spots[k, fields.P_LIGHT] = max(0.1 * before[k], 0.02)
+                spots[k, fields.P_LIGHT] = 0.02 if halo else max(0.1 * before[k], 0.02)
                 break
 
 

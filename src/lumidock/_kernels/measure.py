@@ -79,6 +79,9 @@ def measure(
         reach = wanted
     if share == 0.0:
         return 0
+    if np.sqrt(close.sums[patch.N] / np.pi) * close.where[patch.UNIT] > q[fields.MAX_RADIUS_PX]:
+        _own_plateau(picture, close, v, u, reach, q, known.seen)  # lights may stand in its halo
+        return 0
     _own(known.seen, close)
     ground[patch.SHARED] = samples.mean_by_square(weight, known.shared, 2)
     if planes == 3:  # in the sum of channels fine noise is what JPEG leaves, and coarse noise that of the sensor
@@ -190,7 +193,7 @@ def _own(seen: Image, close: CloseUp) -> None:
 
 @inner
 def _own_plateau(picture: Picture, close: CloseUp, v: int, u: int, reach: float, q: Array, seen: Image) -> None:
-    """Mark the tiles of what is too large to be a light, as far as it is as bright as here in its weakest plane."""
+    """Mark the tiles of what is too large to be a light, as far as it is as bright as here in every plane."""
     darkest, least = 0, 1e9
     for p in range(picture.planes):
         core = samples.core_mean(picture, p, v, u)
@@ -200,4 +203,6 @@ def _own_plateau(picture: Picture, close: CloseUp, v: int, u: int, reach: float,
     close.weight[darkest] = 1.0
     patch.cut(picture, v, u, reach, patch.COARSE_SIDE, close)
     patch.grow(picture, close, LEVELS[-1] * least, q[fields.CLIPPED])
+    for p in range(picture.planes):
+        patch.unmark(close, p, LEVELS[-1] * samples.core_mean(picture, p, v, u))
     _own(seen, close)

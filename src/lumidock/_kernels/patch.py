@@ -337,6 +337,16 @@ def _push(stack: Image, top: int, column: int, row: int, behind: int, begun: int
 
 
 @inner
+def unmark(close: CloseUp, p: int, least: float) -> None:
+    """Take what plane `p` shows darker than `least` out of the region grown last."""
+    mark, stamp, sums = np.int32(close.where[MARK]), close.stamp, close.sums
+    for i in range(int(sums[FIRST_ROW]), int(sums[LAST_ROW]) + 1):
+        for j in range(int(sums[FIRST_COLUMN]), int(sums[LAST_COLUMN]) + 1):
+            if stamp[i + 1, j + 1] == mark and close.stack[p, i, j] < least:
+                stamp[i + 1, j + 1] = 0
+
+
+@inner
 def take_all(close: CloseUp) -> None:
     """Of a region that is a whole window, its columns and rows."""
     sums = close.sums
