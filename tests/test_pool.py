@@ -40,7 +40,7 @@ def test_lights_beside_a_white_funnel_are_found_and_named():
     """Nothing is locked where no dock is in view; where eight lights are, the lock holds and fits the picture."""
     station, camera = load_station(POOL / "station.yaml"), load_camera(POOL / "camera.yaml")
     localizer = Localizer(station, camera)
-    locked, errors = [], []
+    locked, errors, found = [], [], []
     for number, frame in enumerate(open_source(POOL).items()):
         if number >= 150:
             break
@@ -56,5 +56,9 @@ def test_lights_beside_a_white_funnel_are_found_and_named():
             uv = camera.project(station.p_dock @ T_cam_dock[:3, :3].T + T_cam_dock[:3, 3])
             named = fix.match.light >= 0
             errors += np.linalg.norm(fix.match.detections.uv[named] - uv[fix.match.light[named]], axis=1).tolist()
+            inside = ((uv > 2.0) & (uv < (camera.width - 3.0, camera.height - 3.0))).all(axis=1)
+            if inside.sum() >= 6:
+                found.append(set(np.flatnonzero(inside)) <= set(fix.match.light[named].tolist()))
     assert np.mean(locked) > 0.97
+    assert np.mean(found) > 0.95, "all lights in view named"
     assert np.median(errors) < 0.8

@@ -8,6 +8,9 @@ nothing is more precise on a spot of a few pixels, and it knows of the mosaic. O
 saturated, it is the balance of what stands over the level at which the spot is round and alone, which asks of the
 profile only that it is symmetric. Either comes with the covariance that the noise around the spot gives it, and what
 remains without noise.
+
+How much a spot looks like a lamp follows from its contrast, shape, size and blur, from what stands around it, and from
+whether it was there, as bright, in the frame before: snow and the images in a moving surface hardly ever are.
 """
 
 from __future__ import annotations
