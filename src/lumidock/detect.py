@@ -23,7 +23,7 @@ from lumidock._kernels.samples import Picture
 from lumidock.config import DetectConfig
 from lumidock.datatypes import Array, Detections, Frame
 
-_SATURATED = 250.0  # of 255
+SATURATED = 250.0  # of 255, in a picture that uses them all
 _SIXTEEN = 255.0 / 65535.0  # 8-bit levels of a 16-bit step
 _TWELVE_BITS = 16.0  # steps of a sensor of 12 bits in 16
 SWEEP = kernels.SWEEP
@@ -57,6 +57,7 @@ class Scan:
             difference=np.empty((2, w * tiles.TILE_PX * channels), np.int32),
             middle=np.empty((tiles.BLOCK + 1, w), np.uint16),
             ordered=np.empty(hb * wb + 4, np.float32),
+            top=np.zeros(tiles.TOPS, np.int32),
             least=np.empty((2, w), np.int32),
             worth=np.empty(w * tiles.TILE_PX, np.uint8),
             seen=np.zeros((h, w), np.uint8),
@@ -77,6 +78,11 @@ class Scan:
     def fits(self, frame: Frame) -> bool:
         """Whether a frame is like those that this was made for."""
         return self.like == (frame.image.shape, frame.image.dtype, frame.encoding)
+
+    @property
+    def saturated(self) -> float:
+        """The grey level, of 255, from which on samples are saturated in the frames that were seen."""
+        return float(self.q[fields.CLIPPED])
 
     def since(self, t_ns: int, config: DetectConfig) -> tuple[float, bool]:
         """How far, px, a lamp may have moved since the frame before, 0 if that is too long ago; whether it saw all."""
@@ -104,7 +110,8 @@ def _parameters(config: DetectConfig, longer_side: int, least_noise: float, line
     q[fields.FLOOR_PX], q[fields.TEXTURE] = config.floor_px, config.texture
     q[fields.SATURATED_PX], q[fields.CUT_SHARE] = config.saturated_px, config.cut
     q[fields.GLINT_RADII], q[fields.GLINT_RATIO] = config.glint_radii, config.glint_ratio
-    q[fields.GLINT_TRUST], q[fields.CLIPPED], q[fields.MIN_NOISE] = config.glint_trust, _SATURATED, least_noise
+    q[fields.GLINT_TRUST], q[fields.FULL], q[fields.MIN_NOISE] = config.glint_trust, SATURATED, least_noise
+    q[fields.CLIPPED] = SATURATED  # until a frame shows otherwise
     q[fields.PROMINENT], q[fields.COARSE_PX] = config.prominent, config.coarse_px
     q[fields.KIN], q[fields.LAMPS], q[fields.RANGE] = config.kin, config.lamps, config.flux_range
     return q

@@ -10,17 +10,16 @@ import numpy as np
 from lumidock._kernels.colors import colors
 from lumidock.config import LabelConfig
 from lumidock.datatypes import Array, Detections, Frame, Indices
-from lumidock.detect import picture
+from lumidock.detect import SATURATED, picture
 
-_CLIPPED = 250.0  # of 255
 _OF_LETTER = {"b": 0, "g": 1, "r": 2}
 _LINEAR = np.empty(0, np.float32)  # raw mosaics are
 
 
-def label(frame: Frame, detections: Detections, config: LabelConfig) -> Detections:
+def label(frame: Frame, detections: Detections, config: LabelConfig, saturated: float = SATURATED) -> Detections:
     """Set `p_rear` by colour: blue is rear, white is front; NaN for a mono frame or where there is too little light.
 
-    A saturated core is white whatever the lamp, so the ring around it is asked.
+    A core of the grey level `saturated`, of 255, is white whatever the lamp, so the ring around it is asked.
     """
     mosaic = frame.encoding.startswith("bayer")
     if not len(detections) or (frame.image.ndim == 2 and not mosaic):
@@ -33,7 +32,7 @@ def label(frame: Frame, detections: Detections, config: LabelConfig) -> Detectio
         picture(frame),
         _order(frame.encoding),
         _LINEAR if mosaic or frame.image.dtype != np.uint8 else _linear(config.gamma),
-        _CLIPPED,
+        saturated,
         detections.uv,
         detections.radius_px,
         config.ring,

@@ -67,7 +67,7 @@ class Localizer:
         if self.cold:
             self.scan.t_ns = None
         detections = detect.lights(frame, self.config.detect, self.scan, self.foreseen(frame))
-        return self.process_detections(layers.label(frame, detections, self.config.label))
+        return self.process_detections(layers.label(frame, detections, self.config.label, self.scan.saturated))
 
     def foreseen(self, frame: Frame) -> Array | None:
         """Where the lights will be (n, 3) u, v, reach px, while the track holds; None asks for a full search."""

@@ -71,6 +71,7 @@ def see(
         wide, line = picture.rows.view(np.uint16), known.line.view(np.uint16)
         tiles.look(wide, line, planes, (first, last), step, rects, count, known)
     if whole or part == SWEEP - 1:
+        q[fields.CLIPPED] = tiles.saturation(known, picture.scale, q[fields.FULL])
         tiles.settle(known, q[fields.MIN_NOISE] / picture.scale, 1.0 if planes == 4 else _MOST_SHARED)
     rects = rects[: count + 1]
     count = _candidates(picture, known, rects, most[0], q)

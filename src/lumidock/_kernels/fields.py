@@ -50,5 +50,6 @@ COLUMNS = 17
     PROMINENT,
     COARSE_PX,
     TEXTURE,
-) = range(23)
-PARAMETERS = 23
+    FULL,
+) = range(24)
+PARAMETERS = 24

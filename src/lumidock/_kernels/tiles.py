@@ -16,6 +16,9 @@ from lumidock.datatypes import Array, Image, Indices
 TILE_PX, BLOCK = 8, 8  # pixels a side of a tile, tiles a side of a block
 EVERY = constant(1)  # step of rows
 SPARSE = 4  # one block in so many says how samples share their noise
+_LEAST_TOP, TOPS = 160.0, 32  # grey levels: nothing saturates lower; so many of the highest are counted, and ...
+_LEAST_PILE, _PILES, _RIPPLE = 8, 4.0, 5.0  # ... three of them have so many tiles, times as many as the others, and
+# this much ripple under them
 _SIGMA = 0.5117  # of the mean absolute second difference of normal noise: sqrt(pi / 12)
 
 
@@ -25,7 +28,7 @@ class Map(NamedTuple):
     `peak` (P, h, w) largest values of the tiles; of the blocks `raw_level` (P, hb, wb), `raw_sigma` (hb, wb) and
     `by_plane` (2, P, hb, wb / 4), see `survey`; from these `level`, `sigma`, `spread` (P,) and `shared` (4,), see
     `settle`. Scratch: `line` (3, n) bytes, n = 8 w times those of a pixel; `difference` (2, 8 w times the channels);
-    `middle` (9, w) and `ordered` (hb wb + 4,); `least` (2, w) and `worth` (8 w,) of a row of tiles; `seen` (h, w); `found`
+    `middle` (9, w) and `ordered` (hb wb + 4,); `top` (TOPS,); `least` (2, w) and `worth` (8 w,) of a row of tiles; `seen` (h, w); `found`
     (N, 5) and `queue` (2, N).
     """
 
@@ -41,6 +44,7 @@ class Map(NamedTuple):
     difference: NDArray[np.int32]
     middle: Image
     ordered: Array
+    top: NDArray[np.int32]
     least: NDArray[np.int32]
     worth: Image
     seen: Image
@@ -294,6 +298,45 @@ def settle(known: Map, least: float, most: float) -> None:
         own = _median(by_plane[0, p], known.ordered)
         spread[p] = min(max(own / typical, 0.3, least / typical), 3.0)  # less than a step of the sensor is none
         shared[p] = min(max((_median(by_plane[1, p], known.ordered) / max(own, 0.7 * least)) ** 2, 1.0), most)
+
+
+@inner
+def saturation(known: Map, scale: float, usual: float) -> float:
+    """The grey level from which on a sample is saturated: `usual`, or where the brightest tiles pile up below it.
+
+    So they do in video that does not use the whole range, at 235 of 255 for one.
+    """
+    most, top = 0, known.top
+    for p in range(len(known.peak)):
+        for i in range(known.peak.shape[1]):
+            most = max(most, _largest(known.peak[p, i]))
+    if not _LEAST_TOP <= scale * most < usual:
+        return usual
+    top[:] = 0
+    for p in range(len(known.peak)):
+        for i in range(known.peak.shape[1]):
+            row = known.peak[p, i]
+            if scale * (most - _largest(row)) < len(top):
+                for j in range(len(row)):
+                    below = int(scale * (most - row[j]))
+                    if below < len(top):
+                        top[below] += 1
+    at, pile, all_of_them = 0, 0, 0
+    for k in range(len(top)):
+        all_of_them += top[k]
+        here = top[k] + (top[k - 1] if k > 0 else 0) + (top[k + 1] if k + 1 < len(top) else 0)
+        if here > pile:
+            at, pile = k, here
+    usual_pile = 3.0 * (all_of_them - pile) / (len(top) - 3)
+    return scale * most - at - _RIPPLE if pile >= max(_LEAST_PILE, _PILES * usual_pile) else usual
+
+
+@inner
+def _largest(row: Image) -> int:
+    most = np.uint16(0)
+    for j in range(len(row)):
+        most = max(most, row[j])
+    return int(most)
 
 
 @inner
