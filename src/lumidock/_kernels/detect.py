@@ -71,7 +71,7 @@ def see(
         wide, line = picture.rows.view(np.uint16), known.line.view(np.uint16)
         tiles.look(wide, line, planes, (first, last), step, rects, count, known)
     if whole or part == SWEEP - 1:
-        q[fields.CLIPPED] = tiles.saturation(known, picture.scale, q[fields.FULL])
+        q[fields.CLIPPED] = tiles.saturation(picture, known, q[fields.FULL])
         tiles.settle(known, q[fields.MIN_NOISE] / picture.scale, 1.0 if planes == 4 else _MOST_SHARED)
     rects = rects[: count + 1]
     count = _candidates(picture, known, rects, most[0], q)
@@ -115,9 +115,7 @@ def _candidates(picture: Picture, known: tiles.Map, rects: Indices, most: int, q
 
 
 @inner
-def _measured(
-    picture: Picture, known: tiles.Map, close: CloseUp, count: int, most: int, q: Array, spots: Array
-) -> int:
+def _measured(picture: Picture, known: tiles.Map, close: CloseUp, count: int, most: int, q: Array, spots: Array) -> int:
     """Measure the `count` candidates, the brightest first, until `most` are; returns how many spots there are."""
     planes, peak, seen, found = picture.planes, known.peak, known.seen, known.found
     clipped = int(q[fields.CLIPPED] / picture.scale)

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lumidock._kernels import constant, fields, inner
+from lumidock._kernels.samples import Picture, value
 from lumidock.datatypes import Array, Image, Indices
 
 TILE_PX, BLOCK = 8, 8  # pixels a side of a tile, tiles a side of a block
 EVERY = constant(1)  # step of rows
 SPARSE = 4  # one block in so many says how samples share their noise
-_LEAST_TOP, TOPS = 160.0, 32  # grey levels: nothing saturates lower; so many of the highest are counted, and ...
-_LEAST_PILE, _PILES, _RIPPLE = 8, 4.0, 5.0  # ... three of them have so many tiles, times as many as the others, and
-# this much ripple under them
+_LEAST_TOP, TOPS = 160.0, 32  # grey levels: nothing saturates lower, nor so much below the brightest
+_FLAT_TILES, _PLATEAU, _RIPPLE = 4, 6, 5.0  # tiles with so many samples within this much of their largest
 _SIGMA = 0.5117  # of the mean absolute second difference of normal noise: sqrt(pi / 12)
 
 
@@ -53,9 +53,7 @@ class Map(NamedTuple):
 
 
 @inner
-def refresh(
-    rows: Image, planes: int, rect: tuple[int, int, int, int], step: int, peak: Image, line: Image
-) -> None:
+def refresh(rows: Image, planes: int, rect: tuple[int, int, int, int], step: int, peak: Image, line: Image) -> None:
     """Write the largest values of each tile of `rect` into `peak` (P, h, w); `rect` is two rows and two columns.
 
     One map for mono; for `planes` 3 one for each channel; for a mosaic, `planes` 4, the corners of its 2 x 2 cell that
@@ -301,12 +299,13 @@ def settle(known: Map, least: float, most: float) -> None:
 
 
 @inner
-def saturation(known: Map, scale: float, usual: float) -> float:
-    """The grey level from which on a sample is saturated: `usual`, or where the brightest tiles pile up below it.
+def saturation(picture: Picture, known: Map, usual: float) -> float:
+    """The grey level from which on a sample is saturated: `usual`, or where the brightest spots are flat below it.
 
-    So they do in video that does not use the whole range, at 235 of 255 for one.
+    They are in video that does not use the whole range, at 235 of 255 for one. The level is where most of the tiles
+    under the brightest have a plateau.
     """
-    most, top = 0, known.top
+    most, top, scale = 0, known.top, picture.scale
     for p in range(len(known.peak)):
         for i in range(known.peak.shape[1]):
             most = max(most, _largest(known.peak[p, i]))
@@ -320,15 +319,21 @@ def saturation(known: Map, scale: float, usual: float) -> float:
                 for j in range(len(row)):
                     below = int(scale * (most - row[j]))
                     if below < len(top):
-                        top[below] += 1
-    at, pile, all_of_them = 0, 0, 0
+                        top[below] += _is_flat(picture, p, i, j, row[j])
+    at = 0
     for k in range(len(top)):
-        all_of_them += top[k]
-        here = top[k] + (top[k - 1] if k > 0 else 0) + (top[k + 1] if k + 1 < len(top) else 0)
-        if here > pile:
-            at, pile = k, here
-    usual_pile = 3.0 * (all_of_them - pile) / (len(top) - 3)
-    return scale * most - at - _RIPPLE if pile >= max(_LEAST_PILE, _PILES * usual_pile) else usual
+        at = k if top[k] > top[at] else at
+    return scale * most - at - _RIPPLE if top[at] >= _FLAT_TILES else usual
+
+
+@inner
+def _is_flat(picture: Picture, p: int, i: int, j: int, most: int) -> bool:
+    """Whether `_PLATEAU` or more samples of a tile, of a channel or of all of a mosaic, are nearly its largest."""
+    least, count, channels = most - _RIPPLE / picture.scale, 0, 3 if picture.planes == 3 else 1
+    for v in range(i * TILE_PX, min((i + 1) * TILE_PX, picture.height)):
+        for u in range(j * TILE_PX, min((j + 1) * TILE_PX, picture.width)):
+            count += value(picture, v, channels * u + (p if channels == 3 else 0)) >= least
+    return count >= _PLATEAU
 
 
 @inner
