@@ -17,7 +17,7 @@ from lumidock.datatypes import Array, Image, Indices
 TILE_PX, BLOCK = 8, 8  # pixels a side of a tile, tiles a side of a block
 EVERY = constant(1)  # step of rows
 SPARSE = 4  # one block in so many says how samples share their noise
-_LEAST_TOP, TOPS = 160.0, 32  # grey levels: nothing saturates lower, nor so much below the brightest
+_LEAST_TOP, TOPS = 160.0, 16  # grey levels: nothing saturates lower, nor so much below the brightest
 _FLAT_TILES, _PLATEAU, _RIPPLE = 4, 6, 5.0  # tiles with so many samples within this much of their largest
 _SIGMA = 0.5117  # of the mean absolute second difference of normal noise: sqrt(pi / 12)
 
@@ -323,7 +323,8 @@ def saturation(picture: Picture, known: Map, usual: float) -> float:
     at = 0
     for k in range(len(top)):
         at = k if top[k] > top[at] else at
-    return scale * most - at - _RIPPLE if top[at] >= _FLAT_TILES else usual
+    lights = _FLAT_TILES <= top[at] <= known.peak.size // 2  # more is the water
+    return scale * most - at - _RIPPLE if lights else usual
 
 
 @inner
