@@ -320,10 +320,10 @@ def saturation(picture: Picture, known: Map, usual: float) -> float:
                     below = int(scale * (most - row[j]))
                     if below < len(top):
                         top[below] += _is_flat(picture, p, i, j, row[j])
-    at = 0
+    at, flat = 0, 0
     for k in range(len(top)):
-        at = k if top[k] > top[at] else at
-    lights = _FLAT_TILES <= top[at] <= known.peak.size // 2  # more is the water
+        at, flat = k if top[k] > top[at] else at, flat + top[k]
+    lights = top[at] >= _FLAT_TILES and flat < known.peak.size // 2  # more is the water
     return scale * most - at - _RIPPLE if lights else usual
 
 
