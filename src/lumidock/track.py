@@ -38,9 +38,10 @@ class Track:
     `_kernels.track`). `joint`: slow states are being estimated. `log_weight`: log evidence since the track began.
     `proof`: frames since the last failed test in which four lights agreed; it is lost when none do for too long, since
     three fit many poses. `lights_ns`, `agreed_ns`, `layer_ns` (L,): when any light, when four and when each layer was
-    seen last. Of the last frame: `name` (M,) the detection of each light, `apart` (M, 18)
-    what leaving one out would do, `plane` (6,) the one that all lie on (NaN: none), `nis` the normalised innovation
-    squared, `surprise` the same as a normal deviate, and `strain` the running mean of that over frames.
+    seen last. Of the last frame: `name` (M,) the detection of each light, `count` how many of each layer have one,
+    `apart` (M, 18) what leaving one out would do, `plane` (6,) the one that all lie on (NaN: none), `nis` the
+    normalised innovation squared, `surprise` the same as a normal deviate, and `strain` the running mean of that over
+    frames.
     """
 
     t_ns: int
@@ -56,6 +57,7 @@ class Track:
     agreed_ns: int
     layer_ns: Indices
     name: Indices
+    count: tuple[int, ...]
     apart: Array
     plane: Array
     nis: float
@@ -72,7 +74,7 @@ class Track:
     @property
     def n_used(self) -> int:
         """Lights in the last frame that agreed."""
-        return int(np.count_nonzero(self.name >= 0))
+        return sum(self.count)
 
 
 def slow_states(station: Station, attitude: Attitude | None) -> tuple[Array, Array]:
@@ -121,6 +123,7 @@ def start(
         _NEVER,
         never,
         name,
+        plan.count(name),
         np.zeros((len(name), 18)),
         NO_PLANE,
         np.nan,
@@ -295,6 +298,7 @@ def update(
         agreed_ns,
         np.array(layer_ns, np.int64),
         name,
+        count,
         apart,
         plane,
         nis,
@@ -309,7 +313,7 @@ def _deviate(square: float, dof: int) -> float:
     return float(((square / dof) ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(spread))
 
 
-def _plane(count: list[int], plan: Plan, *, joint: bool) -> Array:
+def _plane(count: tuple[int, ...], plan: Plan, *, joint: bool) -> Array:
     """A point and the normal (6,) of the plane of all lights named, `count` by layer; NaN where no slant is asked for.
 
     It is none with two layers in view, and with four lights or more of a track that has seen two.
@@ -324,7 +328,7 @@ def is_joint(name: Indices, plan: Plan, config: TrackConfig) -> bool:
     return _is_joint(plan.count(name), config)
 
 
-def _is_joint(count: list[int], config: TrackConfig) -> bool:
+def _is_joint(count: tuple[int, ...], config: TrackConfig) -> bool:
     return sum(c >= config.joint_lights for c in count) >= 2
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.lens import factor, project, rotate_exp, solve_factored
 from lumidock.datatypes import Array
 
@@ -18,7 +18,7 @@ SAME_TURN = 2e-3  # rad; closer solutions are one
 _MAX_TURN = 0.5  # rad of one step
 
 
-@njit(error_model="numpy")
+@part
 def attitude_error(R: Array, Rp: Array, e: Array, J: Array) -> None:
     """Tilt and roll error `e` (3,) rad against the prior, and `J` (3, 3) for a right perturbation of T_cam_dock.
 
@@ -45,7 +45,7 @@ def attitude_error(R: Array, Rp: Array, e: Array, J: Array) -> None:
         J[2, k] = (cosine * ds - sine * dc) / norm
 
 
-@njit(error_model="numpy")
+@part
 def _add_prior(R: Array, Rp: Array, info: Array, H: Array, g: Array) -> float:
     e, J = np.empty(3), np.empty((3, 3))
     attitude_error(R, Rp, e, J)
@@ -59,7 +59,7 @@ def _add_prior(R: Array, Rp: Array, info: Array, H: Array, g: Array) -> float:
     return cost
 
 
-@njit(error_model="numpy")
+@part
 def light_row(lens: Array, R: Array, t: Array, p: Array, h: Array) -> bool:
     """Pixel and pose Jacobian of the light at `p` (3,), into `h` (14,): u, v, then the two rows of 6; False if unseen.
 
@@ -81,7 +81,7 @@ def light_row(lens: Array, R: Array, t: Array, p: Array, h: Array) -> bool:
     return True
 
 
-@njit(error_model="numpy")
+@part
 def normal_equations(
     lens: Array, p: Array, uv: Array, var: Array, R: Array, t: Array, Rp: Array, info: Array, H: Array, g: Array
 ) -> float:
@@ -103,7 +103,7 @@ def normal_equations(
     return cost
 
 
-@njit(error_model="numpy")
+@part
 def refine(
     lens: Array,
     p: Array,
@@ -156,7 +156,7 @@ def refine(
     return cost, factor(L, 6)
 
 
-@njit(error_model="numpy")
+@part
 def _move(R: Array, t: Array, step: Array) -> None:
     """T <- T Exp(step) to first order in the translation; long turns are cut short."""
     turn = math.sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5])
@@ -166,7 +166,7 @@ def _move(R: Array, t: Array, step: Array) -> None:
     rotate_exp(R, s * step[3], s * step[4], s * step[5])
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def turn(Ra: Array, Rb: Array) -> float:
     """Angle rad between two rotations, small or not."""
     s = 0.0
@@ -176,7 +176,7 @@ def turn(Ra: Array, Rb: Array) -> float:
     return math.sqrt(0.5 * s)
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def flip(p: Array, R: Array, t: Array) -> float:
     """Turn the pose into the other one that a plane seen from afar fits nearly as well; thickness of the set in m.
 
@@ -216,7 +216,13 @@ def flip(p: Array, R: Array, t: Array) -> float:
     return math.sqrt(max(thickness, 0.0))
 
 
-@njit(error_model="numpy")
+@entry
+def flipped(p: Array, R: Array, t: Array) -> float:
+    """`flip`, for Python to call."""
+    return flip(p, R, t)
+
+
+@part
 def _least_axis(A: Array) -> Array:
     """Unit eigenvector (3,) of the smallest eigenvalue of a symmetric `A` (3, 3), by inverse iteration."""
     L = np.empty((3, 3))

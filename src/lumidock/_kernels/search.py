@@ -10,8 +10,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.evidence import (
     GATE,
     HUGE,
@@ -57,7 +57,7 @@ class Goal(NamedTuple):
     best: Array
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def search(scene: Scene, pairs: Indices, unseen: Indices, goal: Goal, count: int, listed: Listed) -> int:
     """Add the best hypotheses to the `count` of a list; returns how many there are then.
 
@@ -89,14 +89,14 @@ def search(scene: Scene, pairs: Indices, unseen: Indices, goal: Goal, count: int
     return count
 
 
-@njit(error_model="numpy")
+@part
 def _wanted(goal: Goal, layers: int) -> int:
     """How many lights of one layer a hypothesis must name to matter."""
     least, floor, most, in_layer = goal.bounds
     return max(least, in_layer, (max(most, floor) + layers - 1) // layers)
 
 
-@njit(inline="always", error_model="numpy")
+@part
 def _try_pair(
     pair: Pair, scene: Scene, view: View, sight: Sight, thirds: Array, goal: Goal, count: int, listed: Listed
 ) -> int:
@@ -123,7 +123,7 @@ def _try_pair(
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def _known(pair: Pair, c: int, o: int, names: Indices, count: int) -> bool:
     """Whether one of `count` listed hypotheses names a pair, and light `c` after detection `o`."""
     for k in range(count):  # noqa: SIM110 - numba compiles no generator
@@ -132,7 +132,7 @@ def _known(pair: Pair, c: int, o: int, names: Indices, count: int) -> bool:
     return False
 
 
-@njit(inline="always", error_model="numpy")
+@part
 def _try_three(three: Naming, held: Indices, layer: int, scene: Scene, goal: Goal, count: int, listed: Listed) -> int:
     """Grow namings from three, and list them: the cheapest fourth light first, then others that it led away from."""
     layers, fourths, sight = scene.like.shape[1], np.empty((_FOURTHS, 3)), new_sight(len(three.name))
@@ -161,7 +161,7 @@ def _try_three(three: Naming, held: Indices, layer: int, scene: Scene, goal: Goa
     return count
 
 
-@njit(inline="always", error_model="numpy")
+@part
 def _grown(layer: int, one: Naming, taken: Indices, scene: Scene, goal: Goal) -> float:
     """Log evidence of a naming of one layer, grown in place: first within the layer, then over all."""
     fitted = grow(layer, one, taken, scene, _wanted(goal, scene.like.shape[1]))
@@ -173,7 +173,7 @@ def _grown(layer: int, one: Naming, taken: Indices, scene: Scene, goal: Goal) ->
     return e
 
 
-@njit(error_model="numpy")
+@part
 def _aim(name: Indices, e: float, layer: Indices, layers: int, goal: Goal) -> None:
     """Raise what is still looked for to what a new best hypothesis names."""
     if e <= goal.best[0]:
@@ -184,7 +184,7 @@ def _aim(name: Indices, e: float, layer: Indices, layers: int, goal: Goal) -> No
         goal.bounds[3] = max(goal.bounds[3], _most_in_layer(name, layer, layers) - 1)
 
 
-@njit(error_model="numpy")
+@part
 def _most_in_layer(name: Indices, layer: Indices, layers: int) -> int:
     count = np.zeros(layers, np.int64)
     for c in range(len(name)):
@@ -193,7 +193,7 @@ def _most_in_layer(name: Indices, layer: Indices, layers: int) -> int:
     return count.max()
 
 
-@njit(error_model="numpy")
+@part
 def _store(one: Naming, e: float, count: int, listed: Listed) -> int:
     """List a hypothesis unless it is known or worse than all of a full list; returns how many there are."""
     scores = listed.scores

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import part
 from lumidock._kernels.lens import rotate_exp
 from lumidock.datatypes import Array
 
 
-@njit(error_model="numpy")
+@part
 def tilt_of(R: Array, t: Array, plane: Array, turn_cov: Array, q: Array, axis: Array) -> tuple[float, float]:
     """Angle rad between a plane's normal and the line of sight to its point, and its sigma.
 
@@ -39,7 +39,7 @@ def tilt_of(R: Array, t: Array, plane: Array, turn_cov: Array, q: Array, axis: A
     return tilt, math.sqrt(max(var, 0.0))
 
 
-@njit(error_model="numpy")
+@part
 def flatten(R: Array, t: Array, plane: Array, turn_cov: Array, Rf: Array, tf: Array) -> None:
     """Turn the plane about its point toward the camera, by three sigmas of its tilt at most."""
     q, d = np.empty(3), np.empty(3)

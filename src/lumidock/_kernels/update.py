@@ -6,8 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.evidence import named_lights
 from lumidock._kernels.lens import factor
 from lumidock._kernels.levels import outputs
@@ -39,7 +39,7 @@ class _Rows(NamedTuple):
     G: Array
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def take_in(
     lens: Array,
     p: Array,
@@ -112,7 +112,7 @@ def take_in(
     return square
 
 
-@njit(error_model="numpy")
+@part
 def _whiten(lens: Array, p: Array, state: State, pixels: Pixels, rows: _Rows) -> bool:
     """Fill all of `rows` but its lights at a state; False where a light is out of the lens's sight."""
     lights, h, cal, Z, G = rows
@@ -146,7 +146,7 @@ def _whiten(lens: Array, p: Array, state: State, pixels: Pixels, rows: _Rows) ->
     return True
 
 
-@njit(error_model="numpy")
+@part
 def _see(lens: Array, p: Array, state: State, rows: _Rows) -> bool:
     """Put the pixels of another state into `rows`, whose Jacobians stay; False where a light is out of sight."""
     at, h, cal = np.empty(3), np.empty(14), np.empty(2)
@@ -157,7 +157,7 @@ def _see(lens: Array, p: Array, state: State, rows: _Rows) -> bool:
     return True
 
 
-@njit(error_model="numpy")
+@part
 def _innovate(pixels: Pixels, dx: Array, rows: _Rows, nu: Array) -> None:
     """Innovation `nu` (2 m,) against the prediction, from which the state is `dx` (n,) away."""
     for k in range(len(rows.lights)):
@@ -167,7 +167,7 @@ def _innovate(pixels: Pixels, dx: Array, rows: _Rows, nu: Array) -> None:
         nu[2 * k + 1] = pixels.uv[i, 1] - h[1] + dot_row(dx, h, cal, 1, c)
 
 
-@njit(error_model="numpy")
+@part
 def _forward(Z: Array, nu: Array, w: Array) -> None:
     """Solve Z w = nu for a lower triangle."""
     for r in range(len(nu)):
@@ -177,7 +177,7 @@ def _forward(Z: Array, nu: Array, w: Array) -> None:
         w[r] = s / Z[r, r]
 
 
-@njit(error_model="numpy")
+@part
 def _shrink(P: Array, G: Array, estimated: int) -> None:
     """Take the information of an update out of `P` (n, n), but not from what is only considered; `G` (2 m, n)."""
     for i in range(len(P)):
@@ -190,7 +190,7 @@ def _shrink(P: Array, G: Array, estimated: int) -> None:
             P[j, i] = P[i, j]
 
 
-@njit(error_model="numpy")
+@part
 def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
     """One-fault solution separation: what leaving each light out of the update would do to the outputs `C`.
 
