@@ -31,8 +31,8 @@ def belief(T_dock_cam, P6, *, lights=4, log_weight=0.0, apart=None):
     name = np.where(np.arange(M) < lights, np.arange(M), -1)
     apart = np.zeros((M, 18)) if apart is None else apart
     R, t = np.ascontiguousarray(T_cam_dock[:3, :3]), np.ascontiguousarray(T_cam_dock[:3, 3])
-    never, count = np.zeros(2, np.int64), PLAN.count(name)
-    return Track(0, 0, R, t, x, P, False, log_weight, 2, 0, 0, never, name, count, apart, NO_PLANE, 1.0, 0.0, 0.0)
+    count = PLAN.count(name)
+    return Track(0, 0, R, t, x, P, False, log_weight, 2, 0, 0, (0, 0), name, count, apart, NO_PLANE, 1.0, 0.0, 0.0)
 
 
 def at(z, rng=None):

@@ -203,7 +203,7 @@ class Localizer:
         """Whether a second layer may be in view where the tilt was too open, or too wrong, to expect it there."""
         if self._plan.n_layers == 1 or seen.lamps - belief.n_used < _MIN_SOLID:
             return False
-        lately = belief.layer_ns > belief.t_ns - self.config.track.max_gap_s * 1e9
+        lately = np.array(belief.layer_ns) > belief.t_ns - self.config.track.max_gap_s * 1e9
         named = np.bincount(self._plan.layer[belief.name >= 0], minlength=self._plan.n_layers) > 0
         return not belief.joint or bool((lately & ~named).any())
 

@@ -55,7 +55,7 @@ class Track:
     proof: int
     lights_ns: int
     agreed_ns: int
-    layer_ns: Indices
+    layer_ns: tuple[int, ...]
     name: Indices
     count: tuple[int, ...]
     apart: Array
@@ -108,7 +108,6 @@ def start(
     x, P = _open_pose(*slow, config)
     R0, t0 = T_cam_dock[:3, :3].copy(), T_cam_dock[:3, 3].copy()
     kernel.attitude_update(R0, t0, x, P, expected.R_dock_cam, 1.0 / expected.info, expected.measured)
-    never = np.full(plan.n_layers, _NEVER, np.int64)
     fresh = Track(
         t_ns,
         t_ns,
@@ -121,7 +120,7 @@ def start(
         0,
         t_ns,
         _NEVER,
-        never,
+        (_NEVER,) * plan.n_layers,
         name,
         plan.count(name),
         np.zeros((len(name), 18)),
@@ -206,10 +205,10 @@ def associate(track: Track, seen: Spots, plan: Plan, config: Config, foreseen: F
     in the wide gate of a single light would set it.
     """
     foreseen = foreseen or look(track, plan)
-    lately = track.t_ns - track.layer_ns <= config.track.max_gap_s * 1e9
-    if lately.all():
+    lately = [track.t_ns - t_ns <= config.track.max_gap_s * 1e9 for t_ns in track.layer_ns]
+    if all(lately):
         return _search(foreseen, seen, plan, config)
-    known = lately[plan.layer]
+    known = np.array(lately)[plan.layer]
     best = _search(foreseen._replace(shown=np.where(known, foreseen.shown, 0.0)), seen, plan, config)
     if foreseen.shown[~known].any():
         wider = _search(foreseen, seen, plan, config)
@@ -223,7 +222,7 @@ def associate(track: Track, seen: Spots, plan: Plan, config: Config, foreseen: F
 def _search(foreseen: Foreseen, seen: Spots, plan: Plan, config: Config) -> Association:
     """The best naming, without names that another nearly as good does not have; none where they are too many."""
     m = len(foreseen.shown)
-    names, costs = np.full((_LEAVES, m), -1, np.int64), np.empty(_LEAVES)
+    names, costs = np.empty((_LEAVES, m), np.int64), np.empty(_LEAVES)
     how = config.track
     terms = association.Terms(seen.log_density, config.match.detect, how.gate, how.reach, how.max_nodes)
     found = association.associate(foreseen, plan.layer, seen.uv, seen.var, seen.like, terms, names, costs)
@@ -277,8 +276,8 @@ def update(
     if not math.isfinite(nis):
         return None
     used, t_ns = sum(count), track.t_ns
-    before = zip(count, track.layer_ns.tolist(), strict=True)
-    layer_ns = [t_ns if c >= LAYER_LIGHTS or (c > 0 and was > _NEVER) else was for c, was in before]
+    before = zip(count, track.layer_ns, strict=True)
+    layer_ns = tuple(t_ns if c >= LAYER_LIGHTS or (c > 0 and was > _NEVER) else was for c, was in before)
     # a pose of which nothing was known takes up six of the pixels' degrees of freedom
     dof = 2 * used - (0 if at is None else 6)
     surprise = _deviate(nis, dof) if dof > 0 else 0.0
@@ -296,7 +295,7 @@ def update(
         proof,
         track.t_ns,
         agreed_ns,
-        np.array(layer_ns, np.int64),
+        layer_ns,
         name,
         count,
         apart,

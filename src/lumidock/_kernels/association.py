@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lumidock._kernels.compiling import entry, part
+from lumidock._kernels.lens import copy_to
 from lumidock._kernels.track import Foreseen
 from lumidock.datatypes import Array, Indices
 
@@ -157,10 +158,11 @@ def _least(
     terms: Terms,
 ) -> Array:
     """The least (D + 1,) that all lights from each depth of `order` on can cost."""
-    depth, miss = len(order), -math.log(1.0 - terms.detect)
+    depth, miss, sharpest = len(order), -math.log(1.0 - terms.detect), np.inf
     least, narrow = np.zeros(depth + 1), np.empty((depth, 3))
-    if depth:
-        _narrowest(foreseen.S, order, var.min(), narrow)
+    for i in range(len(var)):
+        sharpest = min(sharpest, var[i])
+    _narrowest(foreseen.S, order, sharpest, narrow)
     for d in range(depth - 1, -1, -1):
         c = order[d]
         low = miss if foreseen.shown[c] == 2.0 else 0.0
@@ -255,8 +257,8 @@ def _keep(name: Indices, cost: float, names: Indices, costs: Array, found: int) 
     at = found - 1
     while at > 0 and costs[at - 1] > cost:
         costs[at] = costs[at - 1]
-        names[at] = names[at - 1]
+        copy_to(names[at - 1], names[at])
         at -= 1
     costs[at] = cost
-    names[at] = name
+    copy_to(name, names[at])
     return found

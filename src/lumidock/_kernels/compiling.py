@@ -23,25 +23,25 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def entry(function: F) -> F:
     """A kernel that Python calls and no other kernel does; compiled once and kept on disk."""
-    options: dict[str, Any] = {"no_cfunc_wrapper": True}
-    dispatcher = njit(error_model="numpy", **options)(function)
+    dispatcher = _compiled(function)
     dispatcher._cache = _Kept(function)
     return cast(F, dispatcher)
 
 
 def part(function: F) -> F:
     """A kernel that other kernels call; for Python it is a TypeError."""
-    return _part(function)
+    return cast(F, _compiled(function, pipeline_class=_PartCompiler))
 
 
 def fast_part(function: F) -> F:
     """A `part` whose sums may be taken in any order and fused with products."""
-    return _part(function, fastmath={"reassoc", "contract"})
+    return cast(F, _compiled(function, pipeline_class=_PartCompiler, fastmath={"reassoc", "contract"}))
 
 
-def _part(function: F, **options: Any) -> F:  # noqa: ANN401
-    options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": _PartCompiler}
-    return cast(F, njit(error_model="numpy", **options)(function))
+def _compiled(function: F, **options: Any) -> Any:  # noqa: ANN401
+    """With the same options for all: where they differ, numba compiles what it has itself once for each."""
+    options["no_cfunc_wrapper"] = True
+    return njit(error_model="numpy", **options)(function)
 
 
 class _MachineCode(CompileResultCacheImpl):
@@ -98,5 +98,6 @@ class _PartCompiler(Compiler):
 
     def define_pipelines(self) -> object:
         """The usual passes."""
+        self.state.flags.no_cpython_wrapper = True
         self.state.library = _Part(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
         return super().define_pipelines()

@@ -9,8 +9,8 @@ import numpy as np
 
 from lumidock._kernels import constant
 from lumidock._kernels.compiling import entry, part
-from lumidock._kernels.lens import inside
-from lumidock._kernels.pose import light_row, refine
+from lumidock._kernels.lens import copy_to, inside
+from lumidock._kernels.pose import light_row, refine, set_pose
 from lumidock.datatypes import Array, Indices
 
 # entries of the parameters `q`
@@ -69,7 +69,8 @@ def copied(one: Naming) -> Naming:
 @part
 def put(target: Naming, source: Naming) -> None:
     """Overwrite a hypothesis, in place."""
-    target.name[:], target.R[:], target.t[:] = source.name, source.R, source.t
+    copy_to(source.name, target.name)
+    set_pose(target.R, target.t, source.R, source.t)
 
 
 @part
@@ -96,8 +97,8 @@ def fit(one: Naming, scene: Scene, info: Array, steps: int, H: Array, L: Array) 
     ps, uvs, vs = np.empty((len(used), 3)), np.empty((len(used), 2)), np.empty(len(used))
     for k in range(len(used)):
         c = used[k]
-        ps[k] = scene.p[c]
-        uvs[k] = scene.uv[name[c]]
+        copy_to(scene.p[c], ps[k])
+        copy_to(scene.uv[name[c]], uvs[k])
         vs[k] = scene.var[name[c]] + survey_var(scene.lens, R, t, scene.p[c], scene.survey_m2[c])
         log_var += LOG_2PI + math.log(vs[k])
     cost, log_det = refine(scene.lens, ps, uvs, vs, R, t, scene.Rp, info, steps, H, L)
@@ -163,7 +164,8 @@ def evidence(one: Naming, scene: Scene, steps: int, H: Array, L: Array) -> float
     narrow = solved(held, scene, scene.steady, steps, H_held, L)
     if narrow > wide + _ELSEWHERE:
         put(one, held)
-        H[:] = H_held
+        for k in range(6):
+            copy_to(H_held[k], H[k])
     return log_add(wide + math.log(1.0 - steady), narrow + math.log(steady))
 
 
@@ -220,7 +222,7 @@ def named_points(name: Indices, p: Array) -> Array:
     lights = named_lights(name)
     points = np.empty((len(lights), 3))
     for k in range(len(lights)):
-        points[k] = p[lights[k]]
+        copy_to(p[lights[k]], points[k])
     return points
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from lumidock._kernels import constant
 from lumidock._kernels.compiling import part
 from lumidock._kernels.evidence import HUGE, Naming, Scene, innovation, survey_var
+from lumidock._kernels.lens import copy_to
 from lumidock._kernels.pose import light_row
 from lumidock.datatypes import Array, Indices
 
@@ -92,7 +93,7 @@ def _insert(out: Array, found: int, price: float, c: int, i: int) -> int:
         return found
     at = found - 1
     while at > 0 and out[at - 1, 0] > price:
-        out[at] = out[at - 1]
+        copy_to(out[at - 1], out[at])
         at -= 1
     out[at, 0], out[at, 1], out[at, 2] = price, c, i
     return found

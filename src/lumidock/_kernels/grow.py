@@ -24,7 +24,7 @@ from lumidock._kernels.evidence import (
     solved,
 )
 from lumidock._kernels.gates import ANY, Sight, cheapest, look, new_sight, support
-from lumidock._kernels.lens import invert6
+from lumidock._kernels.lens import copy_to, invert6
 from lumidock._kernels.pose import SAME_TURN, flip, turn
 from lumidock.datatypes import Array, Indices
 
@@ -109,7 +109,7 @@ def _most_supported(
             continue
         at = kept - 1
         while at > 0 and tops[at - 1, 0] < worth:
-            tops[at] = tops[at - 1]
+            copy_to(tops[at - 1], tops[at])
             at -= 1
         tops[at, 0], tops[at, 1] = worth, k
     return kept

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from lumidock._kernels.compiling import part
-from lumidock.datatypes import Array
+from lumidock.datatypes import Array, Indices
 
 Projection = tuple[bool, float, float, float, float, float, float, float, float]
 
@@ -86,6 +86,13 @@ def inside(lens: Array, u: float, v: float, margin_px: float) -> bool:
     """Whether a pixel lies in the picture by at least `margin_px`."""
     edge = margin_px - 0.5
     return bool(edge < u < lens[6] - 0.5 - margin_px and edge < v < lens[7] - 0.5 - margin_px)
+
+
+@part
+def copy_to(source: Array | Indices, target: Array | Indices) -> None:
+    """Overwrite `target` (n,), in place. Numba takes far longer to compile an assignment of slices."""
+    for k in range(len(source)):
+        target[k] = source[k]
 
 
 @part

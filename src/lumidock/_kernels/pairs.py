@@ -144,8 +144,9 @@ def know_pair(pair: Pair, scene: Scene, view: View, h: Array, P: Array) -> None:
     R, t = view.R, view.t
     _pose_of(scene.Rp, roll, z, scene.ray[i], scene.p[a], R, t)
     H = view.H
-    H[:3] = 0.0
-    H[3:] = view.open
+    for m in range(3):
+        for o in range(6):
+            H[m, o], H[3 + m, o] = 0.0, view.open[m, o]
     for k in range(2):
         c, d = (a, i) if k == 0 else (b, j)
         if light_row(scene.lens, R, t, scene.p[c], h):

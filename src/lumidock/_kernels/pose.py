@@ -19,6 +19,15 @@ _MAX_TURN = 0.5  # rad of one step
 
 
 @part
+def set_pose(R: Array, t: Array, R_new: Array, t_new: Array) -> None:
+    """Overwrite a pose, in place."""
+    for i in range(3):
+        t[i] = t_new[i]
+        for k in range(3):
+            R[i, k] = R_new[i, k]
+
+
+@part
 def attitude_error(R: Array, Rp: Array, e: Array, J: Array) -> None:
     """Tilt and roll error `e` (3,) rad against the prior, and `J` (3, 3) for a right perturbation of T_cam_dock.
 
@@ -87,8 +96,10 @@ def normal_equations(
 ) -> float:
     """Fill the lower triangle of `H` (6, 6) and `g` (6,) at the pose; the cost, or NaN when a light is out of sight."""
     h = np.empty(14)
-    H[:] = 0.0
-    g[:] = 0.0
+    for i in range(6):
+        g[i] = 0.0
+        for j in range(6):
+            H[i, j] = 0.0
     cost = _add_prior(R, Rp, info, H, g)
     for m in range(len(p)):
         if not light_row(lens, R, t, p[m], h):
@@ -139,11 +150,11 @@ def refine(
         gain = 0.0
         for i in range(6):
             gain += step[i] * g[i]
-        R0[:], t0[:] = R, t
+        set_pose(R0, t0, R, t)
         _move(R, t, step)
         new_cost = normal_equations(lens, p, uv, var, R, t, Rp, info, H, g)
         if not new_cost <= cost + 1e-9:
-            R[:], t[:] = R0, t0
+            set_pose(R, t, R0, t0)
             damping = max(10.0 * damping, 0.01)
             cost = normal_equations(lens, p, uv, var, R, t, Rp, info, H, g)
             continue
@@ -196,10 +207,12 @@ def flip(p: Array, R: Array, t: Array) -> float:
     for i in range(3):
         for j in range(3):
             thickness += normal[i] * A[i, j] * normal[j]
-    q = np.empty(3)
+    q, sight = np.empty(3), np.empty(3)
     for i in range(3):
         q[i] = R[i, 0] * c[0] + R[i, 1] * c[1] + R[i, 2] * c[2] + t[i]
-    sight = q / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    distance = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    for i in range(3):
+        sight[i] = q[i] / distance
     B, C = np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         along = R[i, 0] * normal[0] + R[i, 1] * normal[1] + R[i, 2] * normal[2]
@@ -210,8 +223,9 @@ def flip(p: Array, R: Array, t: Array) -> float:
             C[i, j] = -B[i, j]
             for k in range(3):
                 C[i, j] += 2.0 * sight[i] * sight[k] * B[k, j]
-    R[:] = C
     for i in range(3):
+        for j in range(3):
+            R[i, j] = C[i, j]
         t[i] = q[i] - (R[i, 0] * c[0] + R[i, 1] * c[1] + R[i, 2] * c[2])
     return math.sqrt(max(thickness, 0.0))
 
@@ -225,14 +239,16 @@ def flipped(p: Array, R: Array, t: Array) -> float:
 @part
 def _least_axis(A: Array) -> Array:
     """Unit eigenvector (3,) of the smallest eigenvalue of a symmetric `A` (3, 3), by inverse iteration."""
-    L = np.empty((3, 3))
+    L, x = np.empty((3, 3)), np.empty(3)
     trace = A[0, 0] + A[1, 1] + A[2, 2]
     for i in range(3):
         for j in range(3):
             L[i, j] = A[i, j] + (1e-9 * trace + 1e-15 if i == j else 0.0)
     factor(L, 3)
-    x = np.array([0.3, 0.2, 0.93])
+    x[0], x[1], x[2] = 0.3, 0.2, 0.93
     for _ in range(8):
         solve_factored(L, 3, x)
-        x /= math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+        norm = math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+        for i in range(3):
+            x[i] /= norm
     return x

@@ -72,7 +72,8 @@ def _levelled(p: Array, Rp: Array, R: Array, t: Array) -> None:
     s, c = sine / norm, cosine / norm
     centre, q = np.zeros(3), t.copy()
     for m in range(len(p)):
-        centre += p[m] / len(p)
+        for k in range(3):
+            centre[k] += p[m, k] / len(p)
     for i in range(3):
         for k in range(3):
             q[i] += R[i, k] * centre[k]
@@ -97,8 +98,8 @@ def rivals(one: Naming, taken: Indices, scene: Scene, without: Array, against: A
     """
     best = -HUGE
     H, L, P = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    without[:] = -HUGE
-    against[:] = -HUGE
+    for c in range(len(one.name)):
+        without[c] = against[c] = -HUGE
     for c in range(len(one.name)):
         if one.name[c] < 0:
             continue

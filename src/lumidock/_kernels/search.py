@@ -24,6 +24,7 @@ from lumidock._kernels.evidence import (
     fit,
     log_evidence,
     named,
+    put,
 )
 from lumidock._kernels.gates import ANY, Sight, cheapest, look, new_sight, support
 from lumidock._kernels.grow import NONE, extend, grow
@@ -75,8 +76,7 @@ def search(scene: Scene, pairs: Indices, unseen: Indices, goal: Goal, count: int
             break
         a, b = pairs[s]
         found = pair_poses(a, b, max(_wanted(goal, layers) - 2, 1), scene, view, sight, goal.budget, tries)
-        order = np.argsort(-tries[:found, 0], kind="mergesort")
-        for o in order:
+        for o in _most_first(tries, found, len(scene.p)):
             if tries[o, 0] < max(_wanted(goal, layers) - 2, 1):
                 break
             pair = Pair(a, b, int(tries[o, 1]), int(tries[o, 2]), tries[o, 3], tries[o, 4])
@@ -87,6 +87,21 @@ def search(scene: Scene, pairs: Indices, unseen: Indices, goal: Goal, count: int
         one = Naming(listed.names[k], listed.Rs[k], listed.ts[k])
         listed.scores[k] = evidence(one, scene, STEPS, view.H, view.L)
     return count
+
+
+@part
+def _most_first(tries: Array, found: int, lights: int) -> Indices:
+    """The order (found,) of rows that have most other lights in place first, and of equal ones the earlier."""
+    order, start = np.empty(found, np.int64), np.zeros(lights + 2, np.int64)
+    for o in range(found):
+        start[int(tries[o, 0])] += 1
+    for k in range(lights, -1, -1):  # from counts to the place after all that have as many or more
+        start[k] += start[k + 1]
+    for o in range(found - 1, -1, -1):
+        k = int(tries[o, 0])
+        start[k] -= 1
+        order[start[k]] = o
+    return order
 
 
 @part
@@ -115,7 +130,8 @@ def _try_pair(
         wanted = _wanted(goal, layers)
         if wanted > 3 and wanted > 3 + support(c, o, sight, taken, scene, scene.var, scene.loosest, gate):
             continue
-        name[:] = -1
+        for m in range(len(name)):
+            name[m] = -1
         name[a], name[b], name[c], taken[o] = i, j, o, c
         count = _try_three(Naming(name, view.R, view.t), taken, scene.layer[a], scene, goal, count, listed)
         taken[o] = -1
@@ -190,7 +206,10 @@ def _most_in_layer(name: Indices, layer: Indices, layers: int) -> int:
     for c in range(len(name)):
         if name[c] >= 0:
             count[layer[c]] += 1
-    return count.max()
+    most = 0
+    for k in range(layers):
+        most = max(most, count[k])
+    return most
 
 
 @part
@@ -198,14 +217,26 @@ def _store(one: Naming, e: float, count: int, listed: Listed) -> int:
     """List a hypothesis unless it is known or worse than all of a full list; returns how many there are."""
     scores = listed.scores
     for k in range(count):
-        if (listed.names[k] == one.name).all():
+        if _same(listed.names[k], one.name):
             if e > scores[k]:
-                scores[k], listed.Rs[k], listed.ts[k] = e, one.R, one.t
+                scores[k] = e
+                put(Naming(listed.names[k], listed.Rs[k], listed.ts[k]), one)
             return count
     at = count
     if count == len(scores):
-        at = int(np.argmin(scores))
+        at = 0
+        for k in range(1, count):
+            at = k if scores[k] < scores[at] else at
         if scores[at] >= e:
             return count
-    listed.names[at], scores[at], listed.Rs[at], listed.ts[at] = one.name, e, one.R, one.t
+    scores[at] = e
+    put(Naming(listed.names[at], listed.Rs[at], listed.ts[at]), one)
     return max(count, at + 1)
+
+
+@part
+def _same(a: Indices, b: Indices) -> bool:
+    for c in range(len(a)):  # noqa: SIM110 - numba compiles no generator
+        if a[c] != b[c]:
+            return False
+    return True

@@ -15,7 +15,7 @@ import numpy as np
 
 from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.lens import inside, rotate_exp
-from lumidock._kernels.pose import attitude_error, light_row
+from lumidock._kernels.pose import attitude_error, light_row, set_pose
 from lumidock.datatypes import Array
 
 TWIST, BIAS, CALIBRATION, LIGHTS = 6, 12, 15, 18
@@ -58,7 +58,7 @@ def predict(R: Array, t: Array, twist: Array, P: Array, dt: float, q_lin: float,
         for k in range(3):
             moved[i] += back[i, k] * t[k]
             turned[i, k] = back[i, 0] * R[0, k] + back[i, 1] * R[1, k] + back[i, 2] * R[2, k]
-    R[:], t[:] = turned, moved
+    set_pose(R, t, turned, moved)
     A = _adjoint(R, t)
     AP = np.zeros((6, n))
     for i in range(6):

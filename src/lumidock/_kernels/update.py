@@ -9,8 +9,9 @@ import numpy as np
 
 from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.evidence import named_lights
-from lumidock._kernels.lens import factor
+from lumidock._kernels.lens import copy_to, factor
 from lumidock._kernels.levels import outputs
+from lumidock._kernels.pose import set_pose
 from lumidock._kernels.slant import flatten
 from lumidock._kernels.track import State, apply, difference, dot_row, gains, row
 from lumidock.datatypes import Array, Indices
@@ -73,7 +74,7 @@ def take_in(
     flat, change = State(R.copy(), t.copy(), x, P), 0.0
     difference(R0, t0, R, t, dx)
     for step in range(steps):
-        flat.R[:], flat.t[:] = R, t
+        set_pose(flat.R, flat.t, R, t)
         if slanted and tracking:
             flatten(R, t, plane, turn_cov, flat.R, flat.t)
         if not _whiten(lens, p, flat, pixels, rows):
@@ -82,11 +83,13 @@ def take_in(
             return np.nan
         _innovate(pixels, dx, rows, nu)
         _forward(rows.Z, nu, w)
-        dx[:] = 0.0
+        for j in range(n):
+            dx[j] = 0.0
         for r in range(m):
             for j in range(estimated):
                 dx[j] += w[r] * rows.G[r, j]
-        R[:], t[:], x[:] = R0, t0, x0
+        set_pose(R, t, R0, t0)
+        copy_to(x0, x)
         apply(R, t, x, dx)
         change = 0.0  # of the pose since the step before, in sigmas of the prediction
         for j in range(6):
@@ -102,7 +105,7 @@ def take_in(
     for r in range(m):
         square += w[r] * w[r]
     if slanted:
-        flat.R[:], flat.t[:] = R, t
+        set_pose(flat.R, flat.t, R, t)
         flatten(R, t, plane, turn_cov, flat.R, flat.t)
         if not _whiten(lens, p, flat, pixels, rows):
             return np.nan
@@ -200,10 +203,13 @@ def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
     """
     lights, Z, G, m = rows.lights, rows.Z, rows.G, len(rows.lights)
     V, U, Y = np.empty((2 * m, 2)), np.empty((9, 2)), np.empty((2, 6))
-    apart[:] = 0.0
+    for c in range(len(apart)):
+        for j in range(18):
+            apart[c, j] = 0.0
     for k in range(m):
         a = b = d = wu = wv = 0.0
-        Y[:] = 0.0
+        for o in range(6):
+            Y[0, o] = Y[1, o] = 0.0
         for r in range(2 * k, 2 * m):
             su, sv = 1.0 if r == 2 * k else 0.0, 1.0 if r == 2 * k + 1 else 0.0
             for q in range(2 * k, r):
