@@ -64,7 +64,9 @@ class _Kept(FunctionCache):
         """Load the code for a signature; None where there is none."""
         for name, address in _nrt_python.c_helpers.items():  # what code calls to allocate
             binding.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
-        return self._load_overload(sig, target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
+        return None
 
 
 class _Part(JITCodeLibrary):
