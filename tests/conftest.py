@@ -13,6 +13,7 @@ import pytest
 from commandline import PAPER
 from hypothesis import settings
 from hypothesis import strategies as st
+from numba import njit
 from numpy.testing import assert_allclose
 from pymavlink.dialects.v20 import common
 from scipy.spatial.transform import Rotation
@@ -72,6 +73,16 @@ def transform(t, w):
 def transforms(limit_m=30.0):
     """Transforms (4, 4)."""
     return st.builds(transform, vectors(limit_m), rotation_vectors())
+
+
+def called(kernel):
+    """A kernel that only other kernels can call, as Python can."""
+
+    @njit
+    def call(*args):
+        return kernel(*args)
+
+    return call
 
 
 def numeric_jacobian(function, x, step=1e-6):

@@ -31,8 +31,8 @@ def belief(T_dock_cam, P6, *, lights=4, log_weight=0.0, apart=None):
     name = np.where(np.arange(M) < lights, np.arange(M), -1)
     apart = np.zeros((M, 18)) if apart is None else apart
     R, t = np.ascontiguousarray(T_cam_dock[:3, :3]), np.ascontiguousarray(T_cam_dock[:3, 3])
-    never = np.zeros(2, np.int64)
-    return Track(0, 0, R, t, x, P, False, log_weight, 2, 0, 0, never, name, apart, NO_PLANE, 1.0, 0.0, 0.0)
+    count = PLAN.count(name)
+    return Track(0, 0, R, t, x, P, False, log_weight, 2, 0, 0, (0, 0), name, count, apart, NO_PLANE, 1.0, 0.0, 0.0)
 
 
 def at(z, rng=None):
@@ -220,4 +220,4 @@ def test_a_guide_near_the_dock_holds_as_the_pose_does(z_m, angle):
 def test_stage_is_what_the_pose_rests_on(lights, stage):
     name = np.full(M, -1, np.int64)
     name[list(lights)] = np.arange(len(lights))
-    assert integrity.stage(replace(belief(at(8.0), np.eye(6)), name=name), PLAN) == stage
+    assert integrity.stage(replace(belief(at(8.0), np.eye(6)), name=name, count=PLAN.count(name)), PLAN) == stage

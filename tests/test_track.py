@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from conftest import assert_close, numeric_jacobian
+from conftest import assert_close, called, numeric_jacobian
 from numpy.testing import assert_array_equal
 from tracks import (
     BOTH,
@@ -211,7 +211,7 @@ def test_leaving_a_light_out_does_what_apart_says(rng):
     uv = pixels(before.T_cam_dock, before.x, BOTH) + rng.normal(0, 0.1, (M, 2))
     seen = spots_at(uv)
     full = track.update(before, named(BOTH), seen, PLAN, CONFIG.track)
-    C = outputs(full.R, full.t)
+    C = called(outputs)(full.R, full.t)
 
     def nine(b):
         return C @ b.P[:6, :6] @ C.T

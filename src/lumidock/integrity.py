@@ -21,6 +21,7 @@ _FAR_SHARE, _FAR_DEG = 0.10, 10.0  # beyond: a share of z, and degrees
 GUIDE_BEARING_RAD, GUIDE_RANGE_M, GUIDE_RANGE_SHARE = math.radians(1.5), 0.3, 0.10
 _ANY_BEARING = math.sqrt(2.0) * math.pi  # at the origin itself a bearing says nothing ...
 _CLEAR, _STEEP = 2.0, 0.3  # ... which begins so many range levels away, or with a bearing level of so many rad
+_IDENTITY = np.eye(4)
 GUIDE_FROM_M = 3.0  # nearer to the dock's origin, or past it, bearing and range say nothing and the pose decides
 
 
@@ -69,8 +70,8 @@ def bounds(beliefs: Sequence[Track], config: IntegrityConfig) -> Bounds:
             apart = _apart(first, other)
             wider = apart + np.array(_levels(other, config, np.empty((9, 9))))
             pl = tuple(np.maximum(pl, wider).tolist())
-    T_dock_cam = np.eye(4)
-    T_dock_cam[:3, :3], T_dock_cam[:3, 3] = first.R.T, -(first.R.T @ first.t)
+    T_dock_cam, R_dock_cam = _IDENTITY.copy(), first.R.T
+    T_dock_cam[:3, :3], T_dock_cam[:3, 3] = R_dock_cam, -(R_dock_cam @ first.t)
     x, y, z = first.t.tolist()
     reach = math.sqrt(x * x + y * y + z * z)
     lateral, axial, angle, bearing, distance = pl
@@ -156,9 +157,8 @@ def guide_holds(bound: Bounds) -> bool:
 
 def stage(track: Track, plan: Plan) -> Stage | None:
     """Docking stage by the layers that the pose rests on (paper section 2.2); None without a light."""
-    count = plan.count(track.name)
-    rear = sum(c for c, is_rear in zip(count, plan.is_rear, strict=True) if is_rear)
-    front = sum(count) - rear
+    rear = sum(c for c, is_rear in zip(track.count, plan.is_rear, strict=True) if is_rear)
+    front = track.n_used - rear
     if front and rear:
         return "transition"
     return "rear" if rear else "front" if front else None

@@ -165,7 +165,8 @@ class Localizer:
             )
             if updated is None:
                 weight = belief.log_weight + found.log_evidence
-                unjudged.append(replace(belief, log_weight=weight, name=found.name))
+                count = self._plan.count(found.name)
+                unjudged.append(replace(belief, log_weight=weight, name=found.name, count=count))
             else:
                 followed.append(updated)
         kept = self._likeliest([*followed, *unjudged])
@@ -204,7 +205,7 @@ class Localizer:
         """Whether a second layer may be in view where the tilt was too open, or too wrong, to expect it there."""
         if self._plan.n_layers == 1 or seen.lamps - belief.n_used < _MIN_SOLID:
             return False
-        lately = belief.layer_ns > belief.t_ns - self.config.track.max_gap_s * 1e9
+        lately = np.array(belief.layer_ns) > belief.t_ns - self.config.track.max_gap_s * 1e9
         named = np.bincount(self._plan.layer[belief.name >= 0], minlength=self._plan.n_layers) > 0
         return not belief.joint or bool((lately & ~named).any())
 
@@ -308,7 +309,8 @@ class Localizer:
     def _coast(self, detections: Detections, reason: str) -> Fix:
         """No light fits: a failed test ends trust at once, a dark frame when the last light is too old."""
         nothing = np.full(len(self.station), -1, np.int64)
-        self.beliefs = [replace(b, name=nothing, proof=0 if reason == "residual" else b.proof) for b in self.beliefs]
+        none, failed = self._plan.count(nothing), reason == "residual"
+        self.beliefs = [replace(b, name=nothing, count=none, proof=0 if failed else b.proof) for b in self.beliefs]
         age_s = (detections.t_ns - self.beliefs[0].lights_ns) * 1e-9
         if self.beliefs[0].proof == 0:  # nothing has agreed since a test failed, or for too long
             return self._no_fix(detections, "coasting", "residual")

@@ -54,10 +54,9 @@ class Plan:
     log_volume: float
     sigma_focal: float
 
-    def count(self, name: Indices) -> list[int]:
+    def count(self, name: Indices) -> tuple[int, ...]:
         """How many lights of each layer a naming (M,) names."""
-        count: list[int] = np.bincount(self.layer[name >= 0], minlength=self.n_layers).tolist()
-        return count
+        return tuple(np.bincount(self.layer[name >= 0], minlength=self.n_layers).tolist())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,10 +203,11 @@ def spots(detections: Detections, plan: Plan, config: MatchConfig) -> Spots:
     A spot that looks like no lamp may be more, or less, than one: its centre is worth a share of its radius.
     """
     uv, n = np.ascontiguousarray(detections.uv), len(detections)
-    cov = np.empty((n, 2, 2))
-    cov[:] = np.eye(2) * config.noise_px**2 if detections.cov_px2 is None else detections.cov_px2
-    p_light, var, like = np.empty(n), np.empty(n), np.empty((n, plan.n_layers))
-    p_light[:] = detections.p_light
+    if detections.cov_px2 is None:
+        cov = np.tile(np.eye(2) * config.noise_px**2, (n, 1, 1))
+    else:
+        cov = np.array(detections.cov_px2, np.float64, order="C")
+    p_light, var, like = np.array(detections.p_light, np.float64), np.empty(n), np.empty((n, plan.n_layers))
     radius_px, p_rear = np.ascontiguousarray(detections.radius_px), np.ascontiguousarray(detections.p_rear)
     strange = config.strange, _RADIUS_PX, _STRANGE
     span = kernel.weigh(uv, radius_px, p_rear, plan.is_rear, config.label_trust, strange, cov, p_light, like, var)

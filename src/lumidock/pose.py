@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from lumidock._kernels.pose import flip
+from lumidock._kernels.pose import flipped
 from lumidock.camera import Camera
 from lumidock.datatypes import Array, Indices
 from lumidock.geometry import covariance_in_dock_axes, se3_exp, se3_inverse, se3_log, skew, so3_exp, transform_points
@@ -158,7 +158,7 @@ def _flipped(T_dock_cam: Array, p_dock: Array) -> Array:
     """The other pose from which a plane seen from afar looks nearly the same."""
     T_cam_dock = se3_inverse(T_dock_cam)
     R, t = np.ascontiguousarray(T_cam_dock[:3, :3]), T_cam_dock[:3, 3].copy()
-    flip(np.ascontiguousarray(p_dock), R, t)
+    flipped(np.ascontiguousarray(p_dock), R, t)
     T_cam_dock[:3, :3], T_cam_dock[:3, 3] = R, t
     return se3_inverse(T_cam_dock)
 

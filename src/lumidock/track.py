@@ -38,9 +38,10 @@ class Track:
     `_kernels.track`). `joint`: slow states are being estimated. `log_weight`: log evidence since the track began.
     `proof`: frames since the last failed test in which four lights agreed; it is lost when none do for too long, since
     three fit many poses. `lights_ns`, `agreed_ns`, `layer_ns` (L,): when any light, when four and when each layer was
-    seen last. Of the last frame: `name` (M,) the detection of each light, `apart` (M, 18)
-    what leaving one out would do, `plane` (6,) the one that all lie on (NaN: none), `nis` the normalised innovation
-    squared, `surprise` the same as a normal deviate, and `strain` the running mean of that over frames.
+    seen last. Of the last frame: `name` (M,) the detection of each light, `count` how many of each layer have one,
+    `apart` (M, 18) what leaving one out would do, `plane` (6,) the one that all lie on (NaN: none), `nis` the
+    normalised innovation squared, `surprise` the same as a normal deviate, and `strain` the running mean of that over
+    frames.
     """
 
     t_ns: int
@@ -54,8 +55,9 @@ class Track:
     proof: int
     lights_ns: int
     agreed_ns: int
-    layer_ns: Indices
+    layer_ns: tuple[int, ...]
     name: Indices
+    count: tuple[int, ...]
     apart: Array
     plane: Array
     nis: float
@@ -72,7 +74,7 @@ class Track:
     @property
     def n_used(self) -> int:
         """Lights in the last frame that agreed."""
-        return int(np.count_nonzero(self.name >= 0))
+        return sum(self.count)
 
 
 def slow_states(station: Station, attitude: Attitude | None) -> tuple[Array, Array]:
@@ -106,7 +108,6 @@ def start(
     x, P = _open_pose(*slow, config)
     R0, t0 = T_cam_dock[:3, :3].copy(), T_cam_dock[:3, 3].copy()
     kernel.attitude_update(R0, t0, x, P, expected.R_dock_cam, 1.0 / expected.info, expected.measured)
-    never = np.full(plan.n_layers, _NEVER, np.int64)
     fresh = Track(
         t_ns,
         t_ns,
@@ -119,8 +120,9 @@ def start(
         0,
         t_ns,
         _NEVER,
-        never,
+        (_NEVER,) * plan.n_layers,
         name,
+        plan.count(name),
         np.zeros((len(name), 18)),
         NO_PLANE,
         np.nan,
@@ -203,10 +205,10 @@ def associate(track: Track, seen: Spots, plan: Plan, config: Config, foreseen: F
     in the wide gate of a single light would set it.
     """
     foreseen = foreseen or look(track, plan)
-    lately = track.t_ns - track.layer_ns <= config.track.max_gap_s * 1e9
-    if lately.all():
+    lately = [track.t_ns - t_ns <= config.track.max_gap_s * 1e9 for t_ns in track.layer_ns]
+    if all(lately):
         return _search(foreseen, seen, plan, config)
-    known = lately[plan.layer]
+    known = np.array(lately)[plan.layer]
     best = _search(foreseen._replace(shown=np.where(known, foreseen.shown, 0.0)), seen, plan, config)
     if foreseen.shown[~known].any():
         wider = _search(foreseen, seen, plan, config)
@@ -220,7 +222,7 @@ def associate(track: Track, seen: Spots, plan: Plan, config: Config, foreseen: F
 def _search(foreseen: Foreseen, seen: Spots, plan: Plan, config: Config) -> Association:
     """The best naming, without names that another nearly as good does not have; none where they are too many."""
     m = len(foreseen.shown)
-    names, costs = np.full((_LEAVES, m), -1, np.int64), np.empty(_LEAVES)
+    names, costs = np.empty((_LEAVES, m), np.int64), np.empty(_LEAVES)
     how = config.track
     terms = association.Terms(seen.log_density, config.match.detect, how.gate, how.reach, how.max_nodes)
     found = association.associate(foreseen, plan.layer, seen.uv, seen.var, seen.like, terms, names, costs)
@@ -274,8 +276,8 @@ def update(
     if not math.isfinite(nis):
         return None
     used, t_ns = sum(count), track.t_ns
-    before = zip(count, track.layer_ns.tolist(), strict=True)
-    layer_ns = [t_ns if c >= LAYER_LIGHTS or (c > 0 and was > _NEVER) else was for c, was in before]
+    before = zip(count, track.layer_ns, strict=True)
+    layer_ns = tuple(t_ns if c >= LAYER_LIGHTS or (c > 0 and was > _NEVER) else was for c, was in before)
     # a pose of which nothing was known takes up six of the pixels' degrees of freedom
     dof = 2 * used - (0 if at is None else 6)
     surprise = _deviate(nis, dof) if dof > 0 else 0.0
@@ -293,8 +295,9 @@ def update(
         proof,
         track.t_ns,
         agreed_ns,
-        np.array(layer_ns, np.int64),
+        layer_ns,
         name,
+        count,
         apart,
         plane,
         nis,
@@ -309,7 +312,7 @@ def _deviate(square: float, dof: int) -> float:
     return float(((square / dof) ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(spread))
 
 
-def _plane(count: list[int], plan: Plan, *, joint: bool) -> Array:
+def _plane(count: tuple[int, ...], plan: Plan, *, joint: bool) -> Array:
     """A point and the normal (6,) of the plane of all lights named, `count` by layer; NaN where no slant is asked for.
 
     It is none with two layers in view, and with four lights or more of a track that has seen two.
@@ -324,7 +327,7 @@ def is_joint(name: Indices, plan: Plan, config: TrackConfig) -> bool:
     return _is_joint(plan.count(name), config)
 
 
-def _is_joint(count: list[int], config: TrackConfig) -> bool:
+def _is_joint(count: tuple[int, ...], config: TrackConfig) -> bool:
     return sum(c >= config.joint_lights for c in count) >= 2
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 from collections.abc import Callable, Iterator
 from multiprocessing import get_context
@@ -19,6 +20,7 @@ from lumidock.station import Station
 _FRAMES, _STEP_NS, _STEP = 8, 100_000_000, 0.02
 _BLANK = 5  # the frame without lights, after which the track has to be taken up again
 _FORMATS = {"8 bits": ("bgr8", 255), "16 bits": ("bayer_rggb16", 65535)}
+_OBJECTS = 50_000  # made between two searches for garbage, of which compiling leaves little
 _AWAY = 3.0  # and _STEP in widths of the array, all of whose lights are in the picture then
 
 
@@ -28,7 +30,7 @@ def compile_ahead(station: Station, camera: Camera) -> None:
     What one of them could not, `warm_up` does.
     """
     spawn = get_context("spawn")  # a fork would inherit the locks of OpenCV's threads
-    parts = [spawn.Process(target=part, args=(station, camera), daemon=True) for part in (_detection, _matching)]
+    parts = [spawn.Process(target=_run, args=(part, station, camera), daemon=True) for part in (_detection, _matching)]
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is the parent's, whose end is theirs
     try:
         for part in parts:
@@ -37,6 +39,11 @@ def compile_ahead(station: Station, camera: Camera) -> None:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     for part in parts:
         part.join()
+
+
+def _run(part: Callable[[Station, Camera], None], station: Station, camera: Camera) -> None:
+    gc.set_threshold(_OBJECTS)
+    part(station, camera)
 
 
 def _detection(station: Station, camera: Camera) -> None:

@@ -6,8 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import entry, part
+from lumidock._kernels.lens import copy_to
 from lumidock._kernels.track import Foreseen
 from lumidock.datatypes import Array, Indices
 
@@ -28,7 +29,7 @@ class Terms(NamedTuple):
     max_nodes: int
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def associate(
     foreseen: Foreseen,
     layer: Indices,
@@ -100,7 +101,7 @@ def associate(
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def _candidates(foreseen: Foreseen, uv: Array, var: Array, gate: float) -> tuple[Indices, Indices]:
     """The detections in each light's gate, the likeliest first (M, N), and how many (M,)."""
     m = len(foreseen.shown)
@@ -111,7 +112,7 @@ def _candidates(foreseen: Foreseen, uv: Array, var: Array, gate: float) -> tuple
     return cand, n_cand
 
 
-@njit(error_model="numpy")
+@part
 def _in_gate(foreseen: Foreseen, c: int, uv: Array, var: Array, gate: float, cand: Indices) -> int:
     """The detections in the gate of light `c`, the likeliest first: fills `cand` (N,), returns how many."""
     S, u, v = foreseen.S, foreseen.expected[c, 0], foreseen.expected[c, 1]
@@ -133,7 +134,7 @@ def _in_gate(foreseen: Foreseen, c: int, uv: Array, var: Array, gate: float, can
     return n
 
 
-@njit(error_model="numpy")
+@part
 def _fewest_first(n_cand: Indices, most: int) -> Indices:
     """The lights (D,) that have candidates, up to `most` each, in the order of how many."""
     order, depth = np.empty(len(n_cand), np.int64), 0
@@ -145,7 +146,7 @@ def _fewest_first(n_cand: Indices, most: int) -> Indices:
     return order[:depth]
 
 
-@njit(error_model="numpy")
+@part
 def _least(
     foreseen: Foreseen,
     order: Indices,
@@ -157,10 +158,11 @@ def _least(
     terms: Terms,
 ) -> Array:
     """The least (D + 1,) that all lights from each depth of `order` on can cost."""
-    depth, miss = len(order), -math.log(1.0 - terms.detect)
+    depth, miss, sharpest = len(order), -math.log(1.0 - terms.detect), np.inf
     least, narrow = np.zeros(depth + 1), np.empty((depth, 3))
-    if depth:
-        _narrowest(foreseen.S, order, var.min(), narrow)
+    for i in range(len(var)):
+        sharpest = min(sharpest, var[i])
+    _narrowest(foreseen.S, order, sharpest, narrow)
     for d in range(depth - 1, -1, -1):
         c = order[d]
         low = miss if foreseen.shown[c] == 2.0 else 0.0
@@ -173,7 +175,7 @@ def _least(
     return least
 
 
-@njit(error_model="numpy")
+@part
 def _narrowest(S: Array, order: Indices, var: float, narrow: Array) -> None:
     """Covariance uu, uv, vv (D, 3) of each light's pixel when all before it in `order` (D,) are named.
 
@@ -197,7 +199,7 @@ def _narrowest(S: Array, order: Indices, var: float, narrow: Array) -> None:
         L[n + 1, n + 1] = math.sqrt(max(d + var - L[n + 1, n] ** 2, var))
 
 
-@njit(error_model="numpy")
+@part
 def _name_one(
     expected: Array,
     S: Array,
@@ -244,7 +246,7 @@ def _name_one(
     return 0.5 * (nis + math.log(det)) + _LOG_2PI
 
 
-@njit(error_model="numpy")
+@part
 def _keep(name: Indices, cost: float, names: Indices, costs: Array, found: int) -> int:
     """Put a naming into the sorted list."""
     k = len(costs)
@@ -255,8 +257,8 @@ def _keep(name: Indices, cost: float, names: Indices, costs: Array, found: int) 
     at = found - 1
     while at > 0 and costs[at - 1] > cost:
         costs[at] = costs[at - 1]
-        names[at] = names[at - 1]
+        copy_to(names[at - 1], names[at])
         at -= 1
     costs[at] = cost
-    names[at] = name
+    copy_to(name, names[at])
     return found

@@ -6,11 +6,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from lumidock._kernels import constant
-from lumidock._kernels.lens import inside
-from lumidock._kernels.pose import light_row, refine
+from lumidock._kernels.compiling import entry, part
+from lumidock._kernels.lens import copy_to, inside
+from lumidock._kernels.pose import light_row, refine, set_pose
 from lumidock.datatypes import Array, Indices
 
 # entries of the parameters `q`
@@ -60,19 +60,20 @@ class Naming(NamedTuple):
     t: Array
 
 
-@njit(error_model="numpy")
+@part
 def copied(one: Naming) -> Naming:
     """The same hypothesis in arrays of its own."""
     return Naming(one.name.copy(), one.R.copy(), one.t.copy())
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def put(target: Naming, source: Naming) -> None:
     """Overwrite a hypothesis, in place."""
-    target.name[:], target.R[:], target.t[:] = source.name, source.R, source.t
+    copy_to(source.name, target.name)
+    set_pose(target.R, target.t, source.R, source.t)
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def keep(e: float, best: float, one: Naming, better: Naming) -> float:
     """Remember in `better`, in place, a hypothesis of log evidence `e` that beats the best; the better of the two."""
     if not e > best:
@@ -81,14 +82,14 @@ def keep(e: float, best: float, one: Naming, better: Naming) -> float:
     return e
 
 
-@njit(error_model="numpy")
+@part
 def survey_var(lens: Array, R: Array, t: Array, p: Array, survey_m2: float) -> float:
     """Variance px^2 that the survey error of a light at `p` (3,) adds."""
     z = max(R[2, 0] * p[0] + R[2, 1] * p[1] + R[2, 2] * p[2] + t[2], 0.05)
     return survey_m2 * lens[1] * lens[2] / (z * z)
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def fit(one: Naming, scene: Scene, info: Array, steps: int, H: Array, L: Array) -> tuple[float, float, float]:
     """Most probable pose of the named lights, in place: cost, log det H, and the sum of log(2 pi variance)."""
     name, R, t = one
@@ -96,15 +97,15 @@ def fit(one: Naming, scene: Scene, info: Array, steps: int, H: Array, L: Array) 
     ps, uvs, vs = np.empty((len(used), 3)), np.empty((len(used), 2)), np.empty(len(used))
     for k in range(len(used)):
         c = used[k]
-        ps[k] = scene.p[c]
-        uvs[k] = scene.uv[name[c]]
+        copy_to(scene.p[c], ps[k])
+        copy_to(scene.uv[name[c]], uvs[k])
         vs[k] = scene.var[name[c]] + survey_var(scene.lens, R, t, scene.p[c], scene.survey_m2[c])
         log_var += LOG_2PI + math.log(vs[k])
     cost, log_det = refine(scene.lens, ps, uvs, vs, R, t, scene.Rp, info, steps, H, L)
     return cost, log_det, log_var
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def log_evidence(one: Naming, scene: Scene, info: Array, fitted: tuple[float, float, float]) -> float:
     """Log evidence of a hypothesis over "all clutter", the pose integrated out by Laplace's method."""
     name, R, t = one
@@ -137,7 +138,7 @@ def log_evidence(one: Naming, scene: Scene, info: Array, fitted: tuple[float, fl
     return total
 
 
-@njit(error_model="numpy")
+@part
 def _shines(scene: Scene, R: Array, t: Array, c: int) -> bool:
     """Whether light `c` sends its light toward the camera, which stands at -R^T t."""
     norm, along = 0.0, 0.0
@@ -148,7 +149,7 @@ def _shines(scene: Scene, R: Array, t: Array, c: int) -> bool:
     return along > _SHINES * math.sqrt(norm)
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def evidence(one: Naming, scene: Scene, steps: int, H: Array, L: Array) -> float:
     """Log evidence of a naming whose pose is solved anew, in place, under the whole attitude prior.
 
@@ -163,24 +164,25 @@ def evidence(one: Naming, scene: Scene, steps: int, H: Array, L: Array) -> float
     narrow = solved(held, scene, scene.steady, steps, H_held, L)
     if narrow > wide + _ELSEWHERE:
         put(one, held)
-        H[:] = H_held
+        for k in range(6):
+            copy_to(H_held[k], H[k])
     return log_add(wide + math.log(1.0 - steady), narrow + math.log(steady))
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def solved(one: Naming, scene: Scene, info: Array, steps: int, H: Array, L: Array) -> float:
     """Log evidence of a naming whose pose is solved anew, in place, under an attitude prior of `info` (3,)."""
     return log_evidence(one, scene, info, fit(one, scene, info, steps, H, L))
 
 
-@njit(error_model="numpy")
+@part
 def log_add(a: float, b: float) -> float:
     """Logarithm of the sum of two numbers from their logarithms."""
     high, low = max(a, b), min(a, b)
     return high if low < high - 40.0 else high + math.log1p(math.exp(low - high))
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def innovation(h: Array, P: Array, extra: float, S: Array) -> None:
     """S (3,) = uu, uv, vv of the predicted pixel's covariance, `extra` px^2 on its diagonal."""
     S[0], S[1], S[2] = extra, 0.0, extra
@@ -194,7 +196,7 @@ def innovation(h: Array, P: Array, extra: float, S: Array) -> None:
         S[2] += h[8 + i] * b
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def named(name: Indices) -> int:
     """How many lights a naming names."""
     n = 0
@@ -203,7 +205,7 @@ def named(name: Indices) -> int:
     return n
 
 
-@njit(error_model="numpy")
+@part
 def named_lights(name: Indices) -> Indices:
     """The lights (K,) that a naming names."""
     lights, n = np.empty(named(name), np.int64), 0
@@ -214,17 +216,17 @@ def named_lights(name: Indices) -> Indices:
     return lights
 
 
-@njit(error_model="numpy")
+@part
 def named_points(name: Indices, p: Array) -> Array:
     """Positions (K, 3) of the lights that a naming names."""
     lights = named_lights(name)
     points = np.empty((len(lights), 3))
     for k in range(len(lights)):
-        points[k] = p[lights[k]]
+        copy_to(p[lights[k]], points[k])
     return points
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def weigh(
     uv: Array,
     radius: Array,

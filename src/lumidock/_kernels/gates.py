@@ -6,10 +6,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from lumidock._kernels import constant
+from lumidock._kernels.compiling import part
 from lumidock._kernels.evidence import HUGE, Naming, Scene, innovation, survey_var
+from lumidock._kernels.lens import copy_to
 from lumidock._kernels.pose import light_row
 from lumidock.datatypes import Array, Indices
 
@@ -31,13 +32,13 @@ class Sight(NamedTuple):
     P: Array
 
 
-@njit(error_model="numpy")
+@part
 def new_sight(m: int) -> Sight:
     """Room for `m` lights, none of which is to be found."""
     return Sight(np.empty((m, 14)), np.empty((m, 3)), np.empty(m), np.zeros(m, np.bool_), np.empty((6, 6)))
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def look(allowed: int, one: Naming, scene: Scene, sight: Sight) -> None:
     """Where the unnamed lights of layer `allowed` (-1: any) are expected; fills all of `sight` but `P`."""
     rows, S, extra, there = sight.rows, sight.S, sight.extra, sight.there
@@ -51,7 +52,7 @@ def look(allowed: int, one: Naming, scene: Scene, sight: Sight) -> None:
             innovation(rows[c], sight.P, extra[c], S[c])
 
 
-@njit(error_model="numpy")
+@part
 def cheapest(after: int, sight: Sight, taken: Indices, scene: Scene, gate: float, out: Array) -> tuple[int, int]:
     """The lights in sight that rank after `after` and have a free detection inside their gate, cheapest first.
 
@@ -75,7 +76,7 @@ def cheapest(after: int, sight: Sight, taken: Indices, scene: Scene, gate: float
     return found, near
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def nis(du: float, dv: float, S: Array, var: float) -> tuple[float, float]:
     """Normalised innovation squared of a detection (du, dv) px off, and the log determinant of its covariance."""
     s0, s1, s2 = S[0] + var, S[1], S[2] + var
@@ -83,7 +84,7 @@ def nis(du: float, dv: float, S: Array, var: float) -> tuple[float, float]:
     return (s2 * du * du - 2.0 * s1 * du * dv + s0 * dv * dv) / det, math.log(det)
 
 
-@njit(error_model="numpy")
+@part
 def _insert(out: Array, found: int, price: float, c: int, i: int) -> int:
     """Put a row into `out` (K, 3), cheapest first, unless all of a full one are cheaper; returns how many rows."""
     if found < len(out):
@@ -92,13 +93,13 @@ def _insert(out: Array, found: int, price: float, c: int, i: int) -> int:
         return found
     at = found - 1
     while at > 0 and out[at - 1, 0] > price:
-        out[at] = out[at - 1]
+        copy_to(out[at - 1], out[at])
         at -= 1
     out[at, 0], out[at, 1], out[at, 2] = price, c, i
     return found
 
 
-@njit(error_model="numpy")
+@part
 def support(c: int, i: int, sight: Sight, taken: Indices, scene: Scene, var: Array, loosest: float, gate: float) -> int:
     """How many other lights of the layer in sight find a free detection once `i` is named after light `c`.
 
@@ -123,7 +124,7 @@ def support(c: int, i: int, sight: Sight, taken: Indices, scene: Scene, var: Arr
     return found
 
 
-@njit(error_model="numpy")
+@part
 def _condition(h: Array, P: Array, S: Array, du: float, dv: float, P2: Array, shift: Array) -> None:
     """Kalman update of a pose's covariance `P` by one pixel: `P2`, and the `shift` (6,) of the pose."""
     det, gain = S[0] * S[2] - S[1] * S[1], np.empty((6, 2))
@@ -143,7 +144,7 @@ def _condition(h: Array, P: Array, S: Array, du: float, dv: float, P2: Array, sh
             P2[n, k] = P[n, k] - gain[n, 0] * a - gain[n, 1] * b
 
 
-@njit(error_model="numpy")
+@part
 def occupied(
     u: float,
     v: float,
@@ -168,7 +169,7 @@ def occupied(
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def _first(uv: Array, by_u: Indices, u: float) -> int:
     """Place in the order `by_u` of the first detection whose column is at least `u`."""
     low, high = 0, len(by_u)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from lumidock._kernels import constant
+from lumidock._kernels.compiling import part
 from lumidock._kernels.evidence import (
     GATE,
     HUGE,
@@ -24,7 +24,7 @@ from lumidock._kernels.evidence import (
     solved,
 )
 from lumidock._kernels.gates import ANY, Sight, cheapest, look, new_sight, support
-from lumidock._kernels.lens import invert6
+from lumidock._kernels.lens import copy_to, invert6
 from lumidock._kernels.pose import SAME_TURN, flip, turn
 from lumidock.datatypes import Array, Indices
 
@@ -34,7 +34,7 @@ _BRANCHES, _FIRSTS = 2, 48  # first lights of another layer tried, of so many lo
 _HOPELESS = 30.0  # log evidence; a flipped pose this far behind is not followed
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def grow(allowed: int, one: Naming, taken: Indices, scene: Scene, least: int) -> tuple[float, float, float]:
     """Name light after light of layer `allowed` (-1: any), the cheapest first, solving the pose anew after each.
 
@@ -58,7 +58,7 @@ def grow(allowed: int, one: Naming, taken: Indices, scene: Scene, least: int) ->
     return fitted
 
 
-@njit(error_model="numpy")
+@part
 def extend(one: Naming, taken: Indices, scene: Scene) -> float:
     """Extend a hypothesis of one layer to all, in place, over both poses of the plane and the first light beyond it.
 
@@ -91,7 +91,7 @@ def extend(one: Naming, taken: Indices, scene: Scene) -> float:
     return best
 
 
-@njit(error_model="numpy")
+@part
 def _most_supported(
     out: Array, found: int, sight: Sight, taken: Indices, scene: Scene, gate: float, tops: Array
 ) -> int:
@@ -109,7 +109,7 @@ def _most_supported(
             continue
         at = kept - 1
         while at > 0 and tops[at - 1, 0] < worth:
-            tops[at] = tops[at - 1]
+            copy_to(tops[at - 1], tops[at])
             at -= 1
         tops[at, 0], tops[at, 1] = worth, k
     return kept

@@ -9,19 +9,19 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from lumidock.datatypes import Array
+from lumidock._kernels.compiling import part
+from lumidock.datatypes import Array, Indices
 
 Projection = tuple[bool, float, float, float, float, float, float, float, float]
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@part
 def _unseen() -> Projection:
     return False, np.nan, np.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def project(lens: Array, x: float, y: float, z: float) -> Projection:
     """Whether the lens sees a point in `cam`, its pixel u, v, and the rows du/d(x, y, z), dv/d(x, y, z) px/m."""
     if lens[0] == 1.0:
@@ -48,7 +48,7 @@ def project(lens: Array, x: float, y: float, z: float) -> Projection:
     return True, u * lens[1] + lens[3], v * lens[2] + lens[4], uu, uv, uz, vu, vv, vz
 
 
-@njit(error_model="numpy")
+@part
 def _project_equidistant(lens: Array, x: float, y: float, z: float) -> Projection:
     r = math.sqrt(x * x + y * y)
     theta = math.atan2(r, z)
@@ -81,14 +81,21 @@ def _project_equidistant(lens: Array, x: float, y: float, z: float) -> Projectio
     return True, u, v, uu, uv, along * a * lens[1], vu, vv, along * b * lens[2]
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def inside(lens: Array, u: float, v: float, margin_px: float) -> bool:
     """Whether a pixel lies in the picture by at least `margin_px`."""
     edge = margin_px - 0.5
     return bool(edge < u < lens[6] - 0.5 - margin_px and edge < v < lens[7] - 0.5 - margin_px)
 
 
-@njit(cache=True, error_model="numpy")
+@part
+def copy_to(source: Array | Indices, target: Array | Indices) -> None:
+    """Overwrite `target` (n,), in place. Numba takes far longer to compile an assignment of slices."""
+    for k in range(len(source)):
+        target[k] = source[k]
+
+
+@part
 def factor(A: Array, n: int) -> float:
     """Cholesky factor of the leading (n, n) of `A`, in place in its lower triangle; log det A, NaN if not positive."""
     log_det = 0.0
@@ -107,7 +114,7 @@ def factor(A: Array, n: int) -> float:
     return log_det
 
 
-@njit(error_model="numpy")
+@part
 def solve_factored(L: Array, n: int, b: Array) -> None:
     """Solve L L^T x = b in place for the leading (n, n) of the factor `L`."""
     for i in range(n):
@@ -122,7 +129,7 @@ def solve_factored(L: Array, n: int, b: Array) -> None:
         b[i] = s / L[i, i]
 
 
-@njit(error_model="numpy")
+@part
 def invert6(A: Array, L: Array, P: Array) -> float:
     """Inverse `P` (6, 6) of a symmetric `A` (6, 6), with `L` (6, 6) as work space; log det A, NaN if not positive."""
     for i in range(6):
@@ -149,7 +156,7 @@ def invert6(A: Array, L: Array, P: Array) -> float:
     return log_det
 
 
-@njit(error_model="numpy")
+@part
 def rotate_exp(R: Array, wx: float, wy: float, wz: float) -> None:
     """R <- R Exp(w) in place. Source: Sola eq. (135)."""
     angle = math.sqrt(wx * wx + wy * wy + wz * wz)

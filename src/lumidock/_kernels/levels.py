@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.slant import tilt_of
 from lumidock.datatypes import Array
 
 _TILT_SIGMAS = 2.5  # of a plane's tilt, for what its square does to the range
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def outputs(R: Array, t: Array) -> Array:
     """Jacobian (9, 6) of what a fix says for the pose's tangent.
 
@@ -37,13 +37,13 @@ def outputs(R: Array, t: Array) -> Array:
     return C
 
 
-@njit(error_model="numpy")
+@part
 def _largest2(a: float, b: float, c: float) -> float:
     """Largest eigenvalue of [[a, b], [b, c]]."""
     return 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
 
 
-@njit(error_model="numpy")
+@part
 def _largest3(A: Array) -> float:
     """Largest eigenvalue of the symmetric rows and columns 3..5 of `A`, by the trigonometric formula."""
     m = (A[3, 3] + A[4, 4] + A[5, 5]) / 3.0
@@ -56,7 +56,7 @@ def _largest3(A: Array) -> float:
     return m + 2.0 * p * math.cos(math.acos(min(max(half, -1.0), 1.0)) / 3.0)
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def levels(
     R: Array,
     t: Array,

@@ -6,8 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import part
 from lumidock._kernels.evidence import (
     BEND,
     FAR_M,
@@ -50,7 +50,7 @@ class View(NamedTuple):
     L: Array
 
 
-@njit(error_model="numpy")
+@part
 def new_view(scene: Scene) -> View:
     """Room for a view in which no detection is taken yet."""
     taken = np.full(len(scene.uv), -1, np.int64)
@@ -59,7 +59,7 @@ def new_view(scene: Scene) -> View:
     return View(taken, np.empty((3, 3)), np.empty(3), open_, np.empty((6, 6)), np.empty((6, 6)))
 
 
-@njit(error_model="numpy")
+@part
 def _open_attitude(scene: Scene, open_: Array) -> None:
     """Add the information (3, 6) that the attitude prior has of a pose; of rotation, the last three columns.
 
@@ -72,7 +72,7 @@ def _open_attitude(scene: Scene, open_: Array) -> None:
                 open_[k, 3 + o] += scene.info[m] * scene.Rp[k, axis] * scene.Rp[o, axis]
 
 
-@njit(error_model="numpy")
+@part
 def pair_poses(
     a: int, b: int, least: int, scene: Scene, view: View, sight: Sight, budget: Indices, tries: Array
 ) -> int:
@@ -107,7 +107,7 @@ def pair_poses(
     return found
 
 
-@njit(error_model="numpy")
+@part
 def _pair_pose(d: Array, ray_i: Array, ray_j: Array, q: Array, out: Array) -> int:
     """Depth of the first light and roll that put two lights `d` (3,) apart in the prior's `cam` axes on two rays.
 
@@ -137,15 +137,16 @@ def _pair_pose(d: Array, ray_i: Array, ray_j: Array, q: Array, out: Array) -> in
     return found
 
 
-@njit(error_model="numpy")
+@part
 def know_pair(pair: Pair, scene: Scene, view: View, h: Array, P: Array) -> None:
     """Pose, in `view`, and covariance `P` (6, 6) of two named lights and the expected attitude; `h` (14,) is spare."""
     a, b, i, j, z, roll = pair
     R, t = view.R, view.t
     _pose_of(scene.Rp, roll, z, scene.ray[i], scene.p[a], R, t)
     H = view.H
-    H[:3] = 0.0
-    H[3:] = view.open
+    for m in range(3):
+        for o in range(6):
+            H[m, o], H[3 + m, o] = 0.0, view.open[m, o]
     for k in range(2):
         c, d = (a, i) if k == 0 else (b, j)
         if light_row(scene.lens, R, t, scene.p[c], h):
@@ -156,7 +157,7 @@ def know_pair(pair: Pair, scene: Scene, view: View, h: Array, P: Array) -> None:
     invert6(H, view.L, P)
 
 
-@njit(error_model="numpy")
+@part
 def _pose_of(Rp: Array, roll: float, z: float, ray: Array, p: Array, R: Array, t: Array) -> None:
     """Pose of the prior attitude turned by `roll`, with the light at `p` at depth `z` on `ray`."""
     c, s = math.cos(roll), math.sin(roll)
@@ -168,7 +169,7 @@ def _pose_of(Rp: Array, roll: float, z: float, ray: Array, p: Array, R: Array, t
         t[k] = z * ray[k] / ray[2] - (R[k, 0] * p[0] + R[k, 1] * p[1] + R[k, 2] * p[2])
 
 
-@njit(error_model="numpy")
+@part
 def in_place(pair: Pair, least: int, scene: Scene, view: View, sight: Sight) -> int:
     """How many other lights of the layer have a free detection in their gate; fills the `sight` with where they are.
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.lens import factor, project, rotate_exp, solve_factored
 from lumidock.datatypes import Array
 
@@ -18,7 +18,16 @@ SAME_TURN = 2e-3  # rad; closer solutions are one
 _MAX_TURN = 0.5  # rad of one step
 
 
-@njit(error_model="numpy")
+@part
+def set_pose(R: Array, t: Array, R_new: Array, t_new: Array) -> None:
+    """Overwrite a pose, in place."""
+    for i in range(3):
+        t[i] = t_new[i]
+        for k in range(3):
+            R[i, k] = R_new[i, k]
+
+
+@part
 def attitude_error(R: Array, Rp: Array, e: Array, J: Array) -> None:
     """Tilt and roll error `e` (3,) rad against the prior, and `J` (3, 3) for a right perturbation of T_cam_dock.
 
@@ -45,7 +54,7 @@ def attitude_error(R: Array, Rp: Array, e: Array, J: Array) -> None:
         J[2, k] = (cosine * ds - sine * dc) / norm
 
 
-@njit(error_model="numpy")
+@part
 def _add_prior(R: Array, Rp: Array, info: Array, H: Array, g: Array) -> float:
     e, J = np.empty(3), np.empty((3, 3))
     attitude_error(R, Rp, e, J)
@@ -59,7 +68,7 @@ def _add_prior(R: Array, Rp: Array, info: Array, H: Array, g: Array) -> float:
     return cost
 
 
-@njit(error_model="numpy")
+@part
 def light_row(lens: Array, R: Array, t: Array, p: Array, h: Array) -> bool:
     """Pixel and pose Jacobian of the light at `p` (3,), into `h` (14,): u, v, then the two rows of 6; False if unseen.
 
@@ -81,14 +90,16 @@ def light_row(lens: Array, R: Array, t: Array, p: Array, h: Array) -> bool:
     return True
 
 
-@njit(error_model="numpy")
+@part
 def normal_equations(
     lens: Array, p: Array, uv: Array, var: Array, R: Array, t: Array, Rp: Array, info: Array, H: Array, g: Array
 ) -> float:
     """Fill the lower triangle of `H` (6, 6) and `g` (6,) at the pose; the cost, or NaN when a light is out of sight."""
     h = np.empty(14)
-    H[:] = 0.0
-    g[:] = 0.0
+    for i in range(6):
+        g[i] = 0.0
+        for j in range(6):
+            H[i, j] = 0.0
     cost = _add_prior(R, Rp, info, H, g)
     for m in range(len(p)):
         if not light_row(lens, R, t, p[m], h):
@@ -103,7 +114,7 @@ def normal_equations(
     return cost
 
 
-@njit(error_model="numpy")
+@part
 def refine(
     lens: Array,
     p: Array,
@@ -139,11 +150,11 @@ def refine(
         gain = 0.0
         for i in range(6):
             gain += step[i] * g[i]
-        R0[:], t0[:] = R, t
+        set_pose(R0, t0, R, t)
         _move(R, t, step)
         new_cost = normal_equations(lens, p, uv, var, R, t, Rp, info, H, g)
         if not new_cost <= cost + 1e-9:
-            R[:], t[:] = R0, t0
+            set_pose(R, t, R0, t0)
             damping = max(10.0 * damping, 0.01)
             cost = normal_equations(lens, p, uv, var, R, t, Rp, info, H, g)
             continue
@@ -156,7 +167,7 @@ def refine(
     return cost, factor(L, 6)
 
 
-@njit(error_model="numpy")
+@part
 def _move(R: Array, t: Array, step: Array) -> None:
     """T <- T Exp(step) to first order in the translation; long turns are cut short."""
     turn = math.sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5])
@@ -166,7 +177,7 @@ def _move(R: Array, t: Array, step: Array) -> None:
     rotate_exp(R, s * step[3], s * step[4], s * step[5])
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def turn(Ra: Array, Rb: Array) -> float:
     """Angle rad between two rotations, small or not."""
     s = 0.0
@@ -176,7 +187,7 @@ def turn(Ra: Array, Rb: Array) -> float:
     return math.sqrt(0.5 * s)
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def flip(p: Array, R: Array, t: Array) -> float:
     """Turn the pose into the other one that a plane seen from afar fits nearly as well; thickness of the set in m.
 
@@ -196,10 +207,12 @@ def flip(p: Array, R: Array, t: Array) -> float:
     for i in range(3):
         for j in range(3):
             thickness += normal[i] * A[i, j] * normal[j]
-    q = np.empty(3)
+    q, sight = np.empty(3), np.empty(3)
     for i in range(3):
         q[i] = R[i, 0] * c[0] + R[i, 1] * c[1] + R[i, 2] * c[2] + t[i]
-    sight = q / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    distance = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    for i in range(3):
+        sight[i] = q[i] / distance
     B, C = np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         along = R[i, 0] * normal[0] + R[i, 1] * normal[1] + R[i, 2] * normal[2]
@@ -210,23 +223,32 @@ def flip(p: Array, R: Array, t: Array) -> float:
             C[i, j] = -B[i, j]
             for k in range(3):
                 C[i, j] += 2.0 * sight[i] * sight[k] * B[k, j]
-    R[:] = C
     for i in range(3):
+        for j in range(3):
+            R[i, j] = C[i, j]
         t[i] = q[i] - (R[i, 0] * c[0] + R[i, 1] * c[1] + R[i, 2] * c[2])
     return math.sqrt(max(thickness, 0.0))
 
 
-@njit(error_model="numpy")
+@entry
+def flipped(p: Array, R: Array, t: Array) -> float:
+    """`flip`, for Python to call."""
+    return flip(p, R, t)
+
+
+@part
 def _least_axis(A: Array) -> Array:
     """Unit eigenvector (3,) of the smallest eigenvalue of a symmetric `A` (3, 3), by inverse iteration."""
-    L = np.empty((3, 3))
+    L, x = np.empty((3, 3)), np.empty(3)
     trace = A[0, 0] + A[1, 1] + A[2, 2]
     for i in range(3):
         for j in range(3):
             L[i, j] = A[i, j] + (1e-9 * trace + 1e-15 if i == j else 0.0)
     factor(L, 3)
-    x = np.array([0.3, 0.2, 0.93])
+    x[0], x[1], x[2] = 0.3, 0.2, 0.93
     for _ in range(8):
         solve_factored(L, 3, x)
-        x /= math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+        norm = math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+        for i in range(3):
+            x[i] /= norm
     return x

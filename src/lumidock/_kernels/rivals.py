@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from lumidock._kernels import constant
+from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.evidence import (
     GATE,
     HUGE,
@@ -36,7 +36,7 @@ _STEPS_OTHER, _STEPS_EXCHANGED = constant(20), constant(8)
 _FAR_GATES = 4.0  # gates within which another name is tried
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def other_pose(one: Naming, scene: Scene, level: bool, other: Naming) -> float:
     """Fill `other`, another pose that fits the same names; its log evidence, hugely negative where there is but one.
 
@@ -61,7 +61,7 @@ def other_pose(one: Naming, scene: Scene, level: bool, other: Naming) -> float:
     return log_add(wide, narrow) if turn(one.R, held.R) > turn(other.R, held.R) else wide
 
 
-@njit(error_model="numpy")
+@part
 def _levelled(p: Array, Rp: Array, R: Array, t: Array) -> None:
     """Turn a pose, in place, to the expected attitude with its own roll, about the centre of lights `p` (N, 3)."""
     sine, cosine = 0.0, 0.0
@@ -72,7 +72,8 @@ def _levelled(p: Array, Rp: Array, R: Array, t: Array) -> None:
     s, c = sine / norm, cosine / norm
     centre, q = np.zeros(3), t.copy()
     for m in range(len(p)):
-        centre += p[m] / len(p)
+        for k in range(3):
+            centre[k] += p[m, k] / len(p)
     for i in range(3):
         for k in range(3):
             q[i] += R[i, k] * centre[k]
@@ -86,7 +87,7 @@ def _levelled(p: Array, Rp: Array, R: Array, t: Array) -> None:
             t[i] -= R[i, k] * centre[k]
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def rivals(one: Naming, taken: Indices, scene: Scene, without: Array, against: Array, better: Naming) -> float:
     """Hypotheses one relabelling away, each solved anew.
 
@@ -97,8 +98,8 @@ def rivals(one: Naming, taken: Indices, scene: Scene, without: Array, against: A
     """
     best = -HUGE
     H, L, P = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    without[:] = -HUGE
-    against[:] = -HUGE
+    for c in range(len(one.name)):
+        without[c] = against[c] = -HUGE
     for c in range(len(one.name)):
         if one.name[c] < 0:
             continue
@@ -112,7 +113,7 @@ def rivals(one: Naming, taken: Indices, scene: Scene, without: Array, against: A
     return best
 
 
-@njit(error_model="numpy")
+@part
 def _regrown(c: int, less: Naming, taken: Indices, scene: Scene, against: Array, best: float, better: Naming) -> float:
     """Without the name of light `c` others may find their place."""
     grown, H, L = copied(less), np.empty((6, 6)), np.empty((6, 6))
@@ -124,7 +125,7 @@ def _regrown(c: int, less: Naming, taken: Indices, scene: Scene, against: Array,
     return keep(e, best, grown, better)
 
 
-@njit(error_model="numpy")
+@part
 def _exchanged(
     c: int,
     name: Indices,

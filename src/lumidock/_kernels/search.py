@@ -10,8 +10,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.evidence import (
     GATE,
     HUGE,
@@ -24,6 +24,7 @@ from lumidock._kernels.evidence import (
     fit,
     log_evidence,
     named,
+    put,
 )
 from lumidock._kernels.gates import ANY, Sight, cheapest, look, new_sight, support
 from lumidock._kernels.grow import NONE, extend, grow
@@ -57,7 +58,7 @@ class Goal(NamedTuple):
     best: Array
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def search(scene: Scene, pairs: Indices, unseen: Indices, goal: Goal, count: int, listed: Listed) -> int:
     """Add the best hypotheses to the `count` of a list; returns how many there are then.
 
@@ -75,8 +76,7 @@ def search(scene: Scene, pairs: Indices, unseen: Indices, goal: Goal, count: int
             break
         a, b = pairs[s]
         found = pair_poses(a, b, max(_wanted(goal, layers) - 2, 1), scene, view, sight, goal.budget, tries)
-        order = np.argsort(-tries[:found, 0], kind="mergesort")
-        for o in order:
+        for o in _most_first(tries, found, len(scene.p)):
             if tries[o, 0] < max(_wanted(goal, layers) - 2, 1):
                 break
             pair = Pair(a, b, int(tries[o, 1]), int(tries[o, 2]), tries[o, 3], tries[o, 4])
@@ -89,14 +89,29 @@ def search(scene: Scene, pairs: Indices, unseen: Indices, goal: Goal, count: int
     return count
 
 
-@njit(error_model="numpy")
+@part
+def _most_first(tries: Array, found: int, lights: int) -> Indices:
+    """The order (found,) of rows that have most other lights in place first, and of equal ones the earlier."""
+    order, start = np.empty(found, np.int64), np.zeros(lights + 2, np.int64)
+    for o in range(found):
+        start[int(tries[o, 0])] += 1
+    for k in range(lights, -1, -1):  # from counts to the place after all that have as many or more
+        start[k] += start[k + 1]
+    for o in range(found - 1, -1, -1):
+        k = int(tries[o, 0])
+        start[k] -= 1
+        order[start[k]] = o
+    return order
+
+
+@part
 def _wanted(goal: Goal, layers: int) -> int:
     """How many lights of one layer a hypothesis must name to matter."""
     least, floor, most, in_layer = goal.bounds
     return max(least, in_layer, (max(most, floor) + layers - 1) // layers)
 
 
-@njit(inline="always", error_model="numpy")
+@part
 def _try_pair(
     pair: Pair, scene: Scene, view: View, sight: Sight, thirds: Array, goal: Goal, count: int, listed: Listed
 ) -> int:
@@ -115,7 +130,8 @@ def _try_pair(
         wanted = _wanted(goal, layers)
         if wanted > 3 and wanted > 3 + support(c, o, sight, taken, scene, scene.var, scene.loosest, gate):
             continue
-        name[:] = -1
+        for m in range(len(name)):
+            name[m] = -1
         name[a], name[b], name[c], taken[o] = i, j, o, c
         count = _try_three(Naming(name, view.R, view.t), taken, scene.layer[a], scene, goal, count, listed)
         taken[o] = -1
@@ -123,7 +139,7 @@ def _try_pair(
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def _known(pair: Pair, c: int, o: int, names: Indices, count: int) -> bool:
     """Whether one of `count` listed hypotheses names a pair, and light `c` after detection `o`."""
     for k in range(count):  # noqa: SIM110 - numba compiles no generator
@@ -132,7 +148,7 @@ def _known(pair: Pair, c: int, o: int, names: Indices, count: int) -> bool:
     return False
 
 
-@njit(inline="always", error_model="numpy")
+@part
 def _try_three(three: Naming, held: Indices, layer: int, scene: Scene, goal: Goal, count: int, listed: Listed) -> int:
     """Grow namings from three, and list them: the cheapest fourth light first, then others that it led away from."""
     layers, fourths, sight = scene.like.shape[1], np.empty((_FOURTHS, 3)), new_sight(len(three.name))
@@ -161,7 +177,7 @@ def _try_three(three: Naming, held: Indices, layer: int, scene: Scene, goal: Goa
     return count
 
 
-@njit(inline="always", error_model="numpy")
+@part
 def _grown(layer: int, one: Naming, taken: Indices, scene: Scene, goal: Goal) -> float:
     """Log evidence of a naming of one layer, grown in place: first within the layer, then over all."""
     fitted = grow(layer, one, taken, scene, _wanted(goal, scene.like.shape[1]))
@@ -173,7 +189,7 @@ def _grown(layer: int, one: Naming, taken: Indices, scene: Scene, goal: Goal) ->
     return e
 
 
-@njit(error_model="numpy")
+@part
 def _aim(name: Indices, e: float, layer: Indices, layers: int, goal: Goal) -> None:
     """Raise what is still looked for to what a new best hypothesis names."""
     if e <= goal.best[0]:
@@ -184,28 +200,43 @@ def _aim(name: Indices, e: float, layer: Indices, layers: int, goal: Goal) -> No
         goal.bounds[3] = max(goal.bounds[3], _most_in_layer(name, layer, layers) - 1)
 
 
-@njit(error_model="numpy")
+@part
 def _most_in_layer(name: Indices, layer: Indices, layers: int) -> int:
     count = np.zeros(layers, np.int64)
     for c in range(len(name)):
         if name[c] >= 0:
             count[layer[c]] += 1
-    return count.max()
+    most = 0
+    for k in range(layers):
+        most = max(most, count[k])
+    return most
 
 
-@njit(error_model="numpy")
+@part
 def _store(one: Naming, e: float, count: int, listed: Listed) -> int:
     """List a hypothesis unless it is known or worse than all of a full list; returns how many there are."""
     scores = listed.scores
     for k in range(count):
-        if (listed.names[k] == one.name).all():
+        if _same(listed.names[k], one.name):
             if e > scores[k]:
-                scores[k], listed.Rs[k], listed.ts[k] = e, one.R, one.t
+                scores[k] = e
+                put(Naming(listed.names[k], listed.Rs[k], listed.ts[k]), one)
             return count
     at = count
     if count == len(scores):
-        at = int(np.argmin(scores))
+        at = 0
+        for k in range(1, count):
+            at = k if scores[k] < scores[at] else at
         if scores[at] >= e:
             return count
-    listed.names[at], scores[at], listed.Rs[at], listed.ts[at] = one.name, e, one.R, one.t
+    scores[at] = e
+    put(Naming(listed.names[at], listed.Rs[at], listed.ts[at]), one)
     return max(count, at + 1)
+
+
+@part
+def _same(a: Indices, b: Indices) -> bool:
+    for c in range(len(a)):  # noqa: SIM110 - numba compiles no generator
+        if a[c] != b[c]:
+            return False
+    return True

@@ -12,10 +12,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.lens import inside, rotate_exp
-from lumidock._kernels.pose import attitude_error, light_row
+from lumidock._kernels.pose import attitude_error, light_row, set_pose
 from lumidock.datatypes import Array
 
 TWIST, BIAS, CALIBRATION, LIGHTS = 6, 12, 15, 18
@@ -42,7 +42,7 @@ class Foreseen(NamedTuple):
     shown: Array
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def predict(R: Array, t: Array, twist: Array, P: Array, dt: float, q_lin: float, q_ang: float) -> None:
     """Move pose and covariance on by `dt` s, in place; `q` are the variances that each second adds to the twist."""
     n = len(P)
@@ -58,7 +58,7 @@ def predict(R: Array, t: Array, twist: Array, P: Array, dt: float, q_lin: float,
         for k in range(3):
             moved[i] += back[i, k] * t[k]
             turned[i, k] = back[i, 0] * R[0, k] + back[i, 1] * R[1, k] + back[i, 2] * R[2, k]
-    R[:], t[:] = turned, moved
+    set_pose(R, t, turned, moved)
     A = _adjoint(R, t)
     AP = np.zeros((6, n))
     for i in range(6):
@@ -87,7 +87,7 @@ def predict(R: Array, t: Array, twist: Array, P: Array, dt: float, q_lin: float,
         P[TWIST + k, TWIST + k] += (q_lin if k < 3 else q_ang) * dt
 
 
-@njit(error_model="numpy")
+@part
 def _adjoint(R: Array, t: Array) -> Array:
     """Adjoint (6, 6) of T_dock_cam from `R`, `t` of T_cam_dock."""
     A = np.zeros((6, 6))
@@ -102,7 +102,7 @@ def _adjoint(R: Array, t: Array) -> Array:
     return A
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def attitude_update(R: Array, t: Array, x: Array, P: Array, Rp: Array, var: Array, bias: bool) -> None:
     """Take in an attitude prior or measurement of variance `var` (3,) rad^2, in place; `x` (n,) the other states.
 
@@ -127,7 +127,7 @@ def attitude_update(R: Array, t: Array, x: Array, P: Array, Rp: Array, var: Arra
     apply(R, t, x, dx)
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def apply(R: Array, t: Array, x: Array, dx: Array) -> None:
     """T_cam_dock <- T_cam_dock Exp(dx[:6]); the other states add."""
     move = np.empty(3)
@@ -143,7 +143,7 @@ def apply(R: Array, t: Array, x: Array, dx: Array) -> None:
         x[i] += dx[i]
 
 
-@njit(error_model="numpy")
+@part
 def difference(R0: Array, t0: Array, R: Array, t: Array, dx: Array) -> None:
     """The first six of `dx` that `apply` takes from one pose to the other."""
     D, move = np.empty((3, 3)), np.empty(3)
@@ -165,7 +165,7 @@ def difference(R0: Array, t0: Array, R: Array, t: Array, dx: Array) -> None:
     dx[3], dx[4], dx[5] = a, b, c
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def row(lens: Array, state: State, p: Array, c: int, at: Array, h: Array, cal: Array) -> bool:
     """Pixel and Jacobians of light `c`, False if unseen: `h` (14,) as in `light_row`, `cal` (2,) with du/df, dv/df.
 
@@ -185,7 +185,7 @@ def row(lens: Array, state: State, p: Array, c: int, at: Array, h: Array, cal: A
     return True
 
 
-@njit(error_model="numpy")
+@part
 def gains(P: Array, h: Array, cal: Array, c: int, gu: Array, gv: Array) -> None:
     """P H^T of both rows of light `c`, (n,) each."""
     n = len(P)
@@ -205,7 +205,7 @@ def gains(P: Array, h: Array, cal: Array, c: int, gu: Array, gv: Array) -> None:
             gv[i] += b * P[base + k, i]
 
 
-@njit(error_model="numpy")
+@part
 def dot_row(g: Array, h: Array, cal: Array, axis: int, c: int) -> float:
     """H g for the row of u (`axis` 0) or v (1) of light `c`, as `row` has it."""
     base, o = LIGHTS + 3 * c, 2 + 6 * axis
@@ -217,7 +217,7 @@ def dot_row(g: Array, h: Array, cal: Array, axis: int, c: int) -> float:
     return s
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def look(lens: Array, state: State, p: Array, axis: Array, out: Foreseen) -> None:
     """Fill `out` with where every light at `p` (M, 3), shining along `axis` (M, 3), is expected."""
     expected, S, shown = out
@@ -250,7 +250,7 @@ def look(lens: Array, state: State, p: Array, axis: Array, out: Foreseen) -> Non
                 shown[c] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def windows(foreseen: Foreseen, margin_px: float, most_px: float, out: Array) -> int:
     """Write u, v and reach px, four sigmas and a margin, of each light in sight to `out` (M, 3); how many there are."""
     expected, S, shown = foreseen
@@ -264,7 +264,7 @@ def windows(foreseen: Foreseen, margin_px: float, most_px: float, out: Array) ->
     return count
 
 
-@njit(error_model="numpy")
+@part
 def _shines(state: State, p: Array, axis: Array, c: int) -> bool:
     """Whether light `c` sends its light toward the camera."""
     R, t, x = state.R, state.t, state.x

@@ -6,11 +6,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.evidence import named_lights
-from lumidock._kernels.lens import factor
+from lumidock._kernels.lens import copy_to, factor
 from lumidock._kernels.levels import outputs
+from lumidock._kernels.pose import set_pose
 from lumidock._kernels.slant import flatten
 from lumidock._kernels.track import State, apply, difference, dot_row, gains, row
 from lumidock.datatypes import Array, Indices
@@ -39,7 +40,7 @@ class _Rows(NamedTuple):
     G: Array
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def take_in(
     lens: Array,
     p: Array,
@@ -73,7 +74,7 @@ def take_in(
     flat, change = State(R.copy(), t.copy(), x, P), 0.0
     difference(R0, t0, R, t, dx)
     for step in range(steps):
-        flat.R[:], flat.t[:] = R, t
+        set_pose(flat.R, flat.t, R, t)
         if slanted and tracking:
             flatten(R, t, plane, turn_cov, flat.R, flat.t)
         if not _whiten(lens, p, flat, pixels, rows):
@@ -82,11 +83,13 @@ def take_in(
             return np.nan
         _innovate(pixels, dx, rows, nu)
         _forward(rows.Z, nu, w)
-        dx[:] = 0.0
+        for j in range(n):
+            dx[j] = 0.0
         for r in range(m):
             for j in range(estimated):
                 dx[j] += w[r] * rows.G[r, j]
-        R[:], t[:], x[:] = R0, t0, x0
+        set_pose(R, t, R0, t0)
+        copy_to(x0, x)
         apply(R, t, x, dx)
         change = 0.0  # of the pose since the step before, in sigmas of the prediction
         for j in range(6):
@@ -102,7 +105,7 @@ def take_in(
     for r in range(m):
         square += w[r] * w[r]
     if slanted:
-        flat.R[:], flat.t[:] = R, t
+        set_pose(flat.R, flat.t, R, t)
         flatten(R, t, plane, turn_cov, flat.R, flat.t)
         if not _whiten(lens, p, flat, pixels, rows):
             return np.nan
@@ -112,7 +115,7 @@ def take_in(
     return square
 
 
-@njit(error_model="numpy")
+@part
 def _whiten(lens: Array, p: Array, state: State, pixels: Pixels, rows: _Rows) -> bool:
     """Fill all of `rows` but its lights at a state; False where a light is out of the lens's sight."""
     lights, h, cal, Z, G = rows
@@ -146,7 +149,7 @@ def _whiten(lens: Array, p: Array, state: State, pixels: Pixels, rows: _Rows) ->
     return True
 
 
-@njit(error_model="numpy")
+@part
 def _see(lens: Array, p: Array, state: State, rows: _Rows) -> bool:
     """Put the pixels of another state into `rows`, whose Jacobians stay; False where a light is out of sight."""
     at, h, cal = np.empty(3), np.empty(14), np.empty(2)
@@ -157,7 +160,7 @@ def _see(lens: Array, p: Array, state: State, rows: _Rows) -> bool:
     return True
 
 
-@njit(error_model="numpy")
+@part
 def _innovate(pixels: Pixels, dx: Array, rows: _Rows, nu: Array) -> None:
     """Innovation `nu` (2 m,) against the prediction, from which the state is `dx` (n,) away."""
     for k in range(len(rows.lights)):
@@ -167,7 +170,7 @@ def _innovate(pixels: Pixels, dx: Array, rows: _Rows, nu: Array) -> None:
         nu[2 * k + 1] = pixels.uv[i, 1] - h[1] + dot_row(dx, h, cal, 1, c)
 
 
-@njit(error_model="numpy")
+@part
 def _forward(Z: Array, nu: Array, w: Array) -> None:
     """Solve Z w = nu for a lower triangle."""
     for r in range(len(nu)):
@@ -177,7 +180,7 @@ def _forward(Z: Array, nu: Array, w: Array) -> None:
         w[r] = s / Z[r, r]
 
 
-@njit(error_model="numpy")
+@part
 def _shrink(P: Array, G: Array, estimated: int) -> None:
     """Take the information of an update out of `P` (n, n), but not from what is only considered; `G` (2 m, n)."""
     for i in range(len(P)):
@@ -190,7 +193,7 @@ def _shrink(P: Array, G: Array, estimated: int) -> None:
             P[j, i] = P[i, j]
 
 
-@njit(error_model="numpy")
+@part
 def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
     """One-fault solution separation: what leaving each light out of the update would do to the outputs `C`.
 
@@ -200,10 +203,13 @@ def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
     """
     lights, Z, G, m = rows.lights, rows.Z, rows.G, len(rows.lights)
     V, U, Y = np.empty((2 * m, 2)), np.empty((9, 2)), np.empty((2, 6))
-    apart[:] = 0.0
+    for c in range(len(apart)):
+        for j in range(18):
+            apart[c, j] = 0.0
     for k in range(m):
         a = b = d = wu = wv = 0.0
-        Y[:] = 0.0
+        for o in range(6):
+            Y[0, o] = Y[1, o] = 0.0
         for r in range(2 * k, 2 * m):
             su, sv = 1.0 if r == 2 * k else 0.0, 1.0 if r == 2 * k + 1 else 0.0
             for q in range(2 * k, r):
