@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import entry
 from lumidock._kernels import inner, samples, summing
 from lumidock._kernels.samples import Picture
 from lumidock.datatypes import Array, Indices
@@ -13,7 +13,7 @@ _SAMPLES, _RIM_SAMPLES = 12, 9  # a side of a window at most: of the spot, and o
 _CLIP_ROUNDS, _CLIP = 2, 2.5  # outliers of the background, in sigmas
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def colors(
     picture: Picture,
     order: Indices,

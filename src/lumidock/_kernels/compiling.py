@@ -23,22 +23,22 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def entry(function: F) -> F:
     """A kernel that Python calls and no other kernel does; compiled once and kept on disk."""
-    dispatcher = _compiled(function)
+    dispatcher = compiled(function)
     dispatcher._cache = _Kept(function)
     return cast(F, dispatcher)
 
 
 def part(function: F) -> F:
     """A kernel that other kernels call; for Python it is a TypeError."""
-    return cast(F, _compiled(function, pipeline_class=_PartCompiler))
+    return cast(F, compiled(function, pipeline_class=PartCompiler))
 
 
 def fast_part(function: F) -> F:
     """A `part` whose sums may be taken in any order and fused with products."""
-    return cast(F, _compiled(function, pipeline_class=_PartCompiler, fastmath={"reassoc", "contract"}))
+    return cast(F, compiled(function, pipeline_class=PartCompiler, fastmath={"reassoc", "contract"}))
 
 
-def _compiled(function: F, **options: Any) -> Any:  # noqa: ANN401
+def compiled(function: F, **options: Any) -> Any:  # noqa: ANN401
     """With the same options for all: where they differ, numba compiles what it has itself once for each."""
     options["no_cfunc_wrapper"] = True
     return njit(error_model="numpy", **options)(function)
@@ -95,7 +95,7 @@ class _Part(JITCodeLibrary):
         """Code that is not loaded has no place for one."""
 
 
-class _PartCompiler(Compiler):
+class PartCompiler(Compiler):
     """Numba's compiler, into a `_Part`."""
 
     def define_pipelines(self) -> object:

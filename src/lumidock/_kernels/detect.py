@@ -6,8 +6,8 @@ What is found goes to rows of `spots`, whose columns are named in `fields`.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import entry
 from lumidock._kernels import constant, fields, inlined, inner, peaks, samples, tiles
 from lumidock._kernels.likelihood import dim_glints, dim_small_fry, lamp_probability, weigh_steadiness
 from lumidock._kernels.measure import measure
@@ -27,7 +27,7 @@ _STAY, _STEP = constant(0), constant(1)  # along rows or columns
 _SWEPT_STEP = constant(2)  # of rows, in a tracked search's sweep: the smallest spot still has half its height
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@entry
 def see(
     picture: Picture,
     known: tiles.Map,
