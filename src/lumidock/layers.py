@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 
 from lumidock._kernels.colors import colors
+from lumidock._kernels.samples import picture
 from lumidock.config import LabelConfig
 from lumidock.datatypes import Array, Detections, Frame, Indices
-from lumidock.detect import picture
 
 _CLIPPED = 250.0  # of 255
 _OF_LETTER = {"b": 0, "g": 1, "r": 2}

@@ -6,9 +6,8 @@ What is found goes to rows of `spots`, whose columns are named in `fields`.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from lumidock._kernels import constant, fields, inlined, inner, peaks, samples, tiles
+from lumidock._kernels import constant, fields, inlined, inner, outer, peaks, samples, tiles
 from lumidock._kernels.likelihood import dim_glints, dim_small_fry, lamp_probability
 from lumidock._kernels.measure import measure
 from lumidock._kernels.patch import CloseUp
@@ -23,11 +22,12 @@ _NO_LIMIT = 1 << 16  # of a sample
 _NO_CANDIDATE = 1 << 20  # more than there are
 _OF_TILE = tiles.TILE_PX * tiles.TILE_PX
 _LAST_OF_TILE = _OF_TILE - 1
-_STAY, _STEP = constant(0), constant(1)  # along rows or columns
+_NONE = _STAY = constant(0)
+_STEP = constant(1)  # along rows or columns
 _SWEPT_STEP = constant(2)  # of rows, in a tracked search's sweep: the smallest spot still has half its height
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@outer
 def see(
     picture: Picture,
     known: tiles.Map,
@@ -48,7 +48,7 @@ def see(
     are, and whether all was looked at, as where windows are much of it.
     """
     planes, (h, w), blocks = picture.planes, known.peak.shape[1:], len(known.sigma)
-    count, whole = 0, part < 0
+    count, whole = _NONE, part < 0
     first, last = part * blocks // SWEEP, (part + 1) * blocks // SWEEP
     if not whole:
         count = tiles.windows(expected, spots[:before], _DRIFT_PX, h, w, rects)
@@ -56,7 +56,7 @@ def see(
         rects[count, 2], rects[count, 3] = 0, w
         whole = tiles.area(rects[: count + 1]) >= _MOST_WINDOWS * h * w
     if whole:
-        count, first, last = 0, 0, blocks
+        count, first, last = _NONE, _NONE, blocks
         rects[0, 0], rects[0, 1], rects[0, 2], rects[0, 3] = 0, h, 0, w
     step = tiles.EVERY if whole else _SWEPT_STEP
     if picture.deep == 1:
@@ -81,7 +81,7 @@ def see(
 def _candidates(picture: Picture, known: tiles.Map, rects: Indices, most: int, q: Array) -> int:
     """Write the tiles in `rects` (n, 4) that may hold a light's peak to `known.found`; returns how many."""
     peak, level, sigma, spread, found = known.peak, known.level, known.sigma, known.spread, known.found
-    clipped, count = q[fields.CLIPPED] / picture.scale, 0
+    clipped, count = q[fields.CLIPPED] / picture.scale, _NONE
     contrast = q[fields.CONTRAST] * np.sqrt(samples.largest(known.shared))
     for p in range(len(peak)):
         tiles.clear(known.seen, rects)  # a tile may hold a light in one plane and noise in another
@@ -106,13 +106,11 @@ def _candidates(picture: Picture, known: tiles.Map, rects: Indices, most: int, q
 
 
 @inner
-def _measured(
-    picture: Picture, known: tiles.Map, close: CloseUp, count: int, most: int, q: Array, spots: Array
-) -> int:
+def _measured(picture: Picture, known: tiles.Map, close: CloseUp, count: int, most: int, q: Array, spots: Array) -> int:
     """Measure the `count` candidates, the brightest first, until `most` are; returns how many spots there are."""
     planes, peak, seen, found = picture.planes, known.peak, known.seen, known.found
     clipped = int(q[fields.CLIPPED] / picture.scale)
-    queue, waiting, at, n_waiting, n, work = known.queue[0], known.queue[1], 0, 0, 0, most
+    queue, waiting, at, n_waiting, n, work = known.queue[0], known.queue[1], _NONE, _NONE, _NONE, most
     _brightest_first(planes, peak, clipped, found, count, queue)
     while (at < count or n_waiting) and n < len(spots) and work > 0:
         ranked = n_waiting > 0 and (at == count or waiting[n_waiting - 1] < queue[at])
@@ -156,7 +154,7 @@ def _most_outstanding(found: Array, count: int, most: int, scratch: Array) -> in
 
 @inner
 def _brightest_first(planes: int, peak: Array, clipped: int, found: Array, count: int, queue: Array) -> None:
-    """Queue the candidates by their tile's largest value, the brightest first: their number less `_NO_CANDIDATE` times it.
+    """Queue the candidates by their tile's largest value, the brightest first: number less `_NO_CANDIDATE` times that.
 
     Saturated ones of three channels by the highest rank that their brightest pixel may have: it tells a core from its
     halo.
