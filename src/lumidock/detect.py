@@ -19,12 +19,11 @@ import numpy as np
 
 from lumidock._kernels import detect as kernels
 from lumidock._kernels import fields, patch, tiles
-from lumidock._kernels.samples import Picture
+from lumidock._kernels.samples import picture
 from lumidock.config import DetectConfig
 from lumidock.datatypes import Array, Detections, Frame
 
 SATURATED = 250.0  # of 255, in a picture that uses them all
-_SIXTEEN = 255.0 / 65535.0  # 8-bit levels of a 16-bit step
 _TWELVE_BITS = 16.0  # steps of a sensor of 12 bits in 16
 SWEEP = kernels.SWEEP
 _LEAST_SIDE = 4  # pixels; in less nothing stands out
@@ -65,7 +64,7 @@ class Scan:
             queue=np.empty((2, h * w)),
         )
         self.close = patch.close_up()
-        least_noise = config.min_noise * (1.0 if dtype == np.uint8 else _TWELVE_BITS * _SIXTEEN)
+        least_noise = config.min_noise * (1.0 if dtype == np.uint8 else _TWELVE_BITS * shown.scale)
         self.q = _parameters(config, max(height, width), least_noise, planes == 4 or dtype != np.uint8)
         self.most = (config.max_candidates, config.max_measured)
         self.spots, self.count = np.empty((config.max_spots, fields.COLUMNS)), 0
@@ -88,15 +87,6 @@ class Scan:
         """How far, px, a lamp may have moved since the frame before, 0 if that is too long ago; whether it saw all."""
         dt_s = (t_ns - self.t_ns) * 1e-9 if self.t_ns is not None else 0.0
         return (config.drift_px_s * dt_s if 0.0 < dt_s <= config.memory_s else 0.0), self.saw_all
-
-
-def picture(frame: Frame) -> Picture:
-    """A frame as the kernels take it."""
-    image, (height, width) = np.ascontiguousarray(frame.image), frame.image.shape[:2]
-    planes = 4 if frame.encoding.startswith("bayer") else 3 if image.ndim == 3 else 1
-    deep = image.dtype.itemsize
-    rows = image.reshape(height, -1).view(np.uint8)
-    return Picture(rows, deep, planes, 1.0 if deep == 1 else _SIXTEEN, height, width)
 
 
 def _parameters(config: DetectConfig, longer_side: int, least_noise: float, linear: bool) -> Array:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels.compiling import entry
 from lumidock._kernels import inner, samples, summing
+from lumidock._kernels.compiling import entry
 from lumidock._kernels.samples import Picture
 from lumidock.datatypes import Array, Indices
 
@@ -87,9 +87,7 @@ def _add_disc(
 
 
 @inner
-def _rim(
-    picture: Picture, order: Indices, linear: Array, u: float, v: float, outer: float, rim: Array
-) -> int:
+def _rim(picture: Picture, order: Indices, linear: Array, u: float, v: float, outer: float, rim: Array) -> int:
     """Write the light of each colour in the surroundings of a spot to `rim` (3, N); returns how many samples."""
     pitch, reach, count = 2 if picture.planes == 4 else 1, 2.0 * outer + 2.0, 0
     step = pitch * (1 + int(2.0 * reach) // (_RIM_SAMPLES * pitch))

@@ -178,7 +178,10 @@ def peak_value(close: CloseUp) -> float:
     """Largest sample around the start of a spot, which becomes its start."""
     where, best = close.where, -1e9
     left, top = max(where[patch.START_X] - 1, 0), max(where[patch.START_Y] - 1, 0)
-    right, bottom = min(where[patch.START_X] + 2, where[patch.COLUMNS]), min(where[patch.START_Y] + 2, where[patch.ROWS])
+    right, bottom = (
+        min(where[patch.START_X] + 2, where[patch.COLUMNS]),
+        min(where[patch.START_Y] + 2, where[patch.ROWS]),
+    )
     for y in range(top, bottom):
         for x in range(left, right):
             if close.part[y, x] > best:
@@ -259,7 +262,7 @@ def _plane_shift(close: CloseUp, level: float) -> Center:
 
 
 @summing
-def _add_rims(values: Array, above: Image, here: Image, below: Image, mark: int, sums: Array) -> None:
+def _add_rims(values: Array, above: Image, here: Image, below: Image, mark: np.int32, sums: Array) -> None:
     """Add a row's samples inside of a region, those of them beside one outside, and those outside beside one inside."""
     inside, inner_rim, outer_rim = _NO, _NO, _NO
     for k in range(len(values)):
@@ -288,7 +291,11 @@ def _edge(close: CloseUp, high: float) -> float:
     w0, w1 = np.float32(close.weight[0]), np.float32(close.weight[1])
     w2, w3, limit = np.float32(close.weight[2]), np.float32(close.weight[3]), np.float32(high)
     for i in range(int(sums[patch.FIRST_ROW]), int(sums[patch.LAST_ROW]) + 1):
-        marks, a, b = close.stamp[i + 1, left + 1 : right + 1], close.stack[0, i, left:right], close.stack[1, i, left:right]
+        marks, a, b = (
+            close.stamp[i + 1, left + 1 : right + 1],
+            close.stack[0, i, left:right],
+            close.stack[1, i, left:right],
+        )
         c, d = close.stack[2, i, left:right], close.stack[3, i, left:right]
         for j in range(right - left):
             mixed = w0 * a[j] + w1 * b[j] + w2 * c[j] + w3 * d[j]

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels.compiling import entry
 from lumidock._kernels import constant, fields, inlined, inner, peaks, samples, tiles
+from lumidock._kernels.compiling import entry
 from lumidock._kernels.likelihood import dim_glints, dim_small_fry, lamp_probability, weigh_steadiness
 from lumidock._kernels.measure import measure
 from lumidock._kernels.patch import CloseUp
@@ -23,7 +23,8 @@ _NO_LIMIT = 1 << 16  # of a sample
 _NO_CANDIDATE = 1 << 20  # more than there are
 _OF_TILE = tiles.TILE_PX * tiles.TILE_PX
 _LAST_OF_TILE = _OF_TILE - 1
-_STAY, _STEP = constant(0), constant(1)  # along rows or columns
+_NONE = _STAY = constant(0)
+_STEP = constant(1)  # along rows or columns
 _SWEPT_STEP = constant(2)  # of rows, in a tracked search's sweep: the smallest spot still has half its height
 
 
@@ -51,7 +52,7 @@ def see(
     and measurements. Returns how many spots there are, and whether all was looked at, as where windows are much of it.
     """
     planes, (h, w), blocks = picture.planes, known.peak.shape[1:], len(known.sigma)
-    count, whole = 0, part < 0
+    count, whole = _NONE, part < 0
     for k in range(before):
         for c in range(past.shape[1]):
             past[k, c] = spots[k, c]
@@ -62,7 +63,7 @@ def see(
         rects[count, 2], rects[count, 3] = 0, w
         whole = tiles.area(rects[: count + 1]) >= _MOST_WINDOWS * h * w
     if whole:
-        count, first, last = 0, 0, blocks
+        count, first, last = _NONE, _NONE, blocks
         rects[0, 0], rects[0, 1], rects[0, 2], rects[0, 3] = 0, h, 0, w
     step = tiles.EVERY if whole else _SWEPT_STEP
     if picture.deep == 1:
@@ -90,7 +91,7 @@ def see(
 def _candidates(picture: Picture, known: tiles.Map, rects: Indices, most: int, q: Array) -> int:
     """Write the tiles in `rects` (n, 4) that may hold a light's peak to `known.found`; returns how many."""
     peak, level, sigma, spread, found = known.peak, known.level, known.sigma, known.spread, known.found
-    clipped, count = q[fields.CLIPPED] / picture.scale, 0
+    clipped, count = q[fields.CLIPPED] / picture.scale, _NONE
     contrast = q[fields.CONTRAST] * np.sqrt(samples.largest(known.shared))
     for p in range(len(peak)):
         tiles.clear(known.seen, rects)  # a tile may hold a light in one plane and noise in another
@@ -119,7 +120,7 @@ def _measured(picture: Picture, known: tiles.Map, close: CloseUp, count: int, mo
     """Measure the `count` candidates, the brightest first, until `most` are; returns how many spots there are."""
     planes, peak, seen, found = picture.planes, known.peak, known.seen, known.found
     clipped = int(q[fields.CLIPPED] / picture.scale)
-    queue, waiting, at, n_waiting, n, work = known.queue[0], known.queue[1], 0, 0, 0, most
+    queue, waiting, at, n_waiting, n, work = known.queue[0], known.queue[1], _NONE, _NONE, _NONE, most
     _brightest_first(planes, peak, clipped, found, count, queue)
     while (at < count or n_waiting) and n < len(spots) and work > 0:
         ranked = n_waiting > 0 and (at == count or waiting[n_waiting - 1] < queue[at])
@@ -163,7 +164,7 @@ def _most_outstanding(found: Array, count: int, most: int, scratch: Array) -> in
 
 @inner
 def _brightest_first(planes: int, peak: Array, clipped: int, found: Array, count: int, queue: Array) -> None:
-    """Queue the candidates by their tile's largest value, the brightest first: their number less `_NO_CANDIDATE` times it.
+    """Queue the candidates by their tile's largest value, the brightest first: number less `_NO_CANDIDATE` times that.
 
     Saturated ones of three channels by the highest rank that their brightest pixel may have: it tells a core from its
     halo.

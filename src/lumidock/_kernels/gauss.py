@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import inner, patch, samples, summing
+from lumidock._kernels import constant, inner, patch, samples, summing
 from lumidock._kernels.patch import CloseUp
 from lumidock.datatypes import Array
 
@@ -17,8 +17,9 @@ _FITTED = 2.0  # of the residuals' degrees of freedom, that the position takes u
 # lines of scratch: along the window's two sides, of the samples of one plane, and of those of each of four
 _EX, _EY, _X, _Y, _G, _VARIANCE, _WEIGHT, _SIGNAL, _VALUE, _USED = 0, 1, 2, 3, 4, 5, 6, 7, 8, 12
 _AMPLITUDE, _GROUND = 0, 1
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_FIRST, _ALONE, _ZERO = constant(0), constant(-1), np.float32(0.0)
 Window = tuple[int, int, int, int, int, int]  # left, top, columns and rows of its samples, their planes and distance
+Step = tuple[np.float32, np.float32, np.float32]  # column and row of the first sample, and of the next ones, in widths
 Six = tuple[float, float, float, float, float, float]
 _NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -78,9 +79,7 @@ def averaging(shared: float, width: float) -> float:
 
 
 @inner
-def _read(
-    close: CloseUp, planes: int, center: tuple[float, float], reach: int, clipped: float
-) -> tuple[Window, bool]:
+def _read(close: CloseUp, planes: int, center: tuple[float, float], reach: int, clipped: float) -> tuple[Window, bool]:
     """Write the samples around `center`, row by row, without their level and slope, to the lines of scratch.
 
     With those that are used, which saturated ones are not, and the column and row of each; returns whether all are.
@@ -113,9 +112,13 @@ def _read(
                     value[k + x] = a[x] - base - gu * np.float32(unit * x)
         for k in range(m * n):
             count += used[k]
+        for k in range(m * n, patch.wide(m * n)):
+            value[k] = used[k] = _ZERO
     for y in range(m):
         for x in range(n):
             lines[_X, y * n + x], lines[_Y, y * n + x] = x, y
+    for k in range(m * n, patch.wide(m * n)):
+        lines[_X, k] = lines[_Y, k] = lines[_G, k] = _ZERO
     return (left + unit * j, top + unit * i, n, m, parts, unit), int(count) == parts * m * n
 
 
@@ -127,17 +130,20 @@ def _normal_equations(
     left, top, n, m, parts, unit = window
     lines, fitted = close.lines, close.fitted
     s00, s01, s02, s11, s12, s22, r0, r1, r2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    g, x, y = lines[_G, : n * m], lines[_X, : n * m], lines[_Y, : n * m]
+    count = patch.wide(n * m)
+    g, x, y = lines[_G, :count], lines[_X, :count], lines[_Y, :count]
     for p in range(parts):
         a, b = left + ((p & 1) if parts == 4 else 0) - u, top + (p >> 1) - v
         _profile(lines, a, b, float(unit), s, n, m)
-        value, used = lines[_VALUE + p, : n * m], lines[_USED + p, : n * m]
+        value, used = lines[_VALUE + p, :count], lines[_USED + p, :count]
         shot = np.float32(signal_noise * max(fitted[_AMPLITUDE, p], 0.0))
         amplitude, ground = _amplitude(value, used, g, np.float32(variance), shot)
         fitted[_AMPLITUDE, p], fitted[_GROUND, p] = amplitude, ground
         shot = np.float32(signal_noise * max(amplitude, 0.0))
         at = (np.float32(a / s), np.float32(b / s), np.float32(unit / s))
-        S, side = _equations(value, used, g, x, y, at, np.float32(variance), shot, np.float32(amplitude), np.float32(ground))
+        S, side = _equations(
+            value, used, g, x, y, at, np.float32(variance), shot, np.float32(amplitude), np.float32(ground)
+        )
         per_width = amplitude / s
         square = per_width * per_width
         s00, s01, s02 = s00 + square * S[0], s01 + square * S[1], s02 + square * S[2]
@@ -159,7 +165,7 @@ def _profile(lines: Array, a: float, b: float, step: float, s: float, n: int, m:
 
 
 @summing
-def _amplitude(z: Array, used: Array, g: Array, variance: float, shot: float) -> tuple[float, float]:
+def _amplitude(z: Array, used: Array, g: Array, variance: np.float32, shot: np.float32) -> tuple[float, float]:
     """Least-squares amplitude and background of one plane under the present profile, of the samples `used`.
 
     `shot` is the variance that the profile adds to the noise's where it is 1.
@@ -187,11 +193,11 @@ def _equations(
     profile: Array,
     x: Array,
     y: Array,
-    at: tuple[float, float, float],
-    variance: float,
-    shot: float,
-    amplitude: float,
-    ground: float,
+    at: Step,
+    variance: np.float32,
+    shot: np.float32,
+    amplitude: np.float32,
+    ground: np.float32,
 ) -> tuple[Six, tuple[float, float, float]]:
     """One plane's share of the normal equations, for an amplitude of one width; `at`: place of sample 0, and a step."""
     s00, s01, s02, s11, s12, s22, r0, r1, r2 = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
@@ -222,7 +228,9 @@ def _equations(
         j_2 += w2
     side = (float(r0), float(r1), float(r2))
     S = (float(s00), float(s01), float(s02), float(s11), float(s12), float(s22))
-    return _without_plane(S, (float(gg), float(g1), float(n)), (float(g_0), float(g_1), float(g_2)), (float(j_0), float(j_1), float(j_2))), side
+    return _without_plane(
+        S, (float(gg), float(g1), float(n)), (float(g_0), float(g_1), float(g_2)), (float(j_0), float(j_1), float(j_2))
+    ), side
 
 
 @inner
@@ -280,7 +288,7 @@ def _misfit(
                 a, b, c, d = _odd(lines, p, i * n + first, (y - i) * n + x - first, last - first)
                 total, least, weight, square = total + a, least + b, weight + c, square + d
         else:
-            a, b, c, d = _odd(lines, p, 0, -1, n * m)
+            a, b, c, d = _odd(lines, p, _FIRST, _ALONE, n * m)
             total, least, weight, square = total + a, least + b, weight + c, square + d
     if weight <= 0.0:
         return 1.0
@@ -294,11 +302,11 @@ def _residuals(
     lines: Array,
     p: int,
     count: int,
-    at: tuple[float, float, float],
-    amplitude: float,
-    ground: float,
-    variance: float,
-    signal_noise: float,
+    at: Step,
+    amplitude: np.float32,
+    ground: np.float32,
+    variance: np.float32,
+    signal_noise: np.float32,
 ) -> None:
     """Write a plane's residuals over its values, their variance, what they say of the place, and the signal."""
     value, g, x, y = lines[_VALUE + p], lines[_G], lines[_X], lines[_Y]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import fields, inner, patch, peaks, samples, tiles
+from lumidock._kernels import constant, fields, inner, patch, peaks, samples, tiles
 from lumidock._kernels.describe import FILTER_PX, describe, holds_another, peak_value, small_snr
 from lumidock._kernels.patch import CloseUp
 from lumidock._kernels.samples import Picture
 from lumidock.datatypes import Array, Image
 
 LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out, until it is round and alone
+_FARTHER = (constant(4), constant(8), constant(16))  # tiles at which the flanks of a wide light show
 _MAX_TILES = 20  # a light is not wider
 _ROUNDS = 4
 _QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth having clears 1.8
@@ -123,7 +124,7 @@ def _extent(peak: Image, i: int, j: int, level: Array) -> float:
         if over > most:
             p, most = k, over
     step = 0
-    for far in (4, 8, 16):
+    for far in _FARTHER:
         step = max(step, peaks.over_pairs(peak[p], i, j, far))
     half = float(peak[p, i, j]) - 0.5 * min(most, 0.5 * step)
     width, height = 1, 1

@@ -38,14 +38,15 @@ _NOTHING, _QUARTER, _TWO, _NO_MARK = np.float32(0.0), np.float32(0.25), np.float
 class CloseUp(NamedTuple):
     """Room for the close-up of one light, used for one after the other.
 
-    `stack` (4, ROOM, ROOM) its planes and `part` (ROOM, ROOM) their mean by `weight` (4,); `where`, `ground` and `sums`:
-    see above. `stamp` and `taken` (ROOM + 2, ROOM + 2), from row and column 1 on, have the mark of the region that a
-    sample was counted to last, by `grow` and by `soften`; `fitted` (2, 4) amplitude and background of each plane; `runs` (ROOM^2, 5), `rings` (8, RING) and `lines` (LINES,
-    LINE) are scratch.
+    `stack` (4, ROOM, ROOM) its planes, `part` (ROOM, ROOM) their mean by `weight` (4,); `where`, `ground`, `sums`: see
+    above. `stamp` and `taken` (ROOM + 2, ROOM + 2), from row and column 1 on, have the mark of the region that a
+    sample was counted to last, by `grow` and by `soften`; `fitted` (2, 4): amplitude and background of each plane;
+    `across` (ROOM, ROOM), `runs` (ROOM^2, 5), `rings` (8, RING) and `lines` (LINES, LINE) are scratch.
     """
 
     stack: NDArray[np.float32]
     part: NDArray[np.float32]
+    across: NDArray[np.float32]
     stamp: NDArray[np.int32]
     taken: NDArray[np.int32]
     runs: NDArray[np.int32]
@@ -63,6 +64,7 @@ def close_up() -> CloseUp:
     return CloseUp(
         stack=np.zeros((4, ROOM, ROOM), np.float32),
         part=np.zeros((ROOM, ROOM), np.float32),
+        across=np.zeros((ROOM, ROOM), np.float32),
         stamp=np.zeros((ROOM + 2, ROOM + 2), np.int32),
         taken=np.zeros((ROOM + 2, ROOM + 2), np.int32),
         runs=np.zeros((ROOM * ROOM, 5), np.int32),
@@ -86,7 +88,8 @@ def cut(picture: Picture, v: int, u: int, reach: float, side: int, close: CloseU
     columns = min((min(u + int(reach) + 1, picture.width) - left) // unit, ROOM)
     rows = min((min(v + int(reach) + 1, picture.height) - top) // unit, ROOM)
     where[LEFT], where[TOP], where[UNIT], where[COLUMNS], where[ROWS] = left, top, unit, max(columns, 1), max(rows, 1)
-    where[START_X], where[START_Y] = min((u - left) // unit, max(columns, 1) - 1), min((v - top) // unit, max(rows, 1) - 1)
+    where[START_X] = min((u - left) // unit, where[COLUMNS] - 1)
+    where[START_Y] = min((v - top) // unit, where[ROWS] - 1)
     if picture.deep == 1:
         _read(picture.rows, picture, where, close.stack)
     else:
@@ -122,7 +125,7 @@ def _read(rows: Image, picture: Picture, where: Indices, stack: NDArray[np.float
 @inner
 def _mix(planes: int, close: CloseUp) -> None:
     """Write the weighted mean of the planes to the part."""
-    stack, n, weight = close.stack, close.where[COLUMNS], close.weight
+    stack, n, weight = close.stack, wide(close.where[COLUMNS]), close.weight
     w0, w1, w2, w3 = np.float32(weight[0]), np.float32(weight[1]), np.float32(weight[2]), np.float32(weight[3])
     for i in range(close.where[ROWS]):
         out, a, b, c, d = close.part[i], stack[0, i], stack[1, i], stack[2, i], stack[3, i]
@@ -186,7 +189,7 @@ def flatten(close: CloseUp, reach: float) -> tuple[float, float, float]:
         slope = np.float32(gx)
         for i in range(rows):
             line, first = part[i], np.float32(gy * (i - y) - gx * x)
-            for j in range(columns):
+            for j in range(wide(columns)):
                 line[j] -= first + slope * np.float32(j)
     return level, spread, _ROOT_TWO * uneven[pairs // 2] / 0.674
 
@@ -194,22 +197,24 @@ def flatten(close: CloseUp, reach: float) -> tuple[float, float, float]:
 @inner
 def smooth(close: CloseUp) -> None:
     """Average with the neighbours by 1 2 1 in either direction: a clipped core is torn by noise, and by interlacing."""
-    part, columns, rows, before = close.part, close.where[COLUMNS], close.where[ROWS], close.lines[0]
+    part, across, last, rows = close.part, close.across, close.where[COLUMNS] - 1, close.where[ROWS]
+    n = min(wide(last + 1), ROOM - 1)
     for i in range(rows):
-        line = part[i]
-        for j in range(columns):
-            before[j + 1] = line[j]
-        before[0], before[columns + 1] = line[0], line[columns - 1]
-        for j in range(columns):
-            line[j] = _QUARTER * (before[j] + _TWO * before[j + 1] + before[j + 2])
-    for j in range(columns):
-        before[j] = part[0, j]
+        line, out = part[i], across[i]
+        for j in range(1, n):
+            out[j] = _QUARTER * (line[j - 1] + _TWO * line[j] + line[j + 1])
+        out[0] = _QUARTER * (line[0] + _TWO * line[0] + line[min(1, last)])
+        out[last] = _QUARTER * (line[max(last - 1, 0)] + _TWO * line[last] + line[last])
     for i in range(rows):
-        line, below = part[i], part[min(i + 1, rows - 1)]
-        for j in range(columns):
-            here = line[j]
-            line[j] = _QUARTER * (before[j] + _TWO * here + below[j])
-            before[j] = here
+        out, above, here, below = part[i], across[max(i - 1, 0)], across[i], across[min(i + 1, rows - 1)]
+        for j in range(n + 1):
+            out[j] = _QUARTER * (above[j] + _TWO * here[j] + below[j])
+
+
+@inlined
+def wide(columns: int) -> int:
+    """So many samples, and some more of no meaning that fill what is taken at once."""
+    return (columns + 15) & -16
 
 
 @inner
@@ -290,7 +295,7 @@ def grow(picture: Picture, close: CloseUp, level: float, clipped: float) -> None
     limit, burnt = np.float32(level), np.float32(clipped)
     sums[:] = 0.0
     left, right, upper, lower = x, x, y, y
-    _push(stack, 0, x, y, y, 0, -1)
+    _push(stack, 0, x, y, -1, 0, 0)
     top = 1
     while top:  # a run of one row at a time
         top -= 1
@@ -356,7 +361,7 @@ def take_all(close: CloseUp) -> None:
 
 @summing
 def _add_run(
-    values: Array, marks: Image, mark: int, a: int, b: int, level: float, clipped: float, sums: Array
+    values: Array, marks: Image, mark: np.int32, a: int, b: int, level: float, clipped: np.float32, sums: Array
 ) -> None:
     """Add samples of one row, the first at `a`, `b`, to the sums of a region, and mark them."""
     n, w, wx, burnt = float(len(values)), np.float32(0.0), np.float32(0.0), np.float32(0.0)
@@ -423,28 +428,30 @@ def soften(close: CloseUp, lower: float) -> tuple[float, float]:
     return x0 / w0 - x1 / w1, y0 / w0 - y1 / w1
 
 
-@summing
+@inner
 def _soft_row(
-    values: Array, above: Image, here: Image, below: Image, mark: int, lower: float, taken: Image
+    values: Array, above: Image, here: Image, below: Image, mark: np.int32, lower: np.float32, taken: Image
 ) -> tuple[float, float, float, float, float]:
     """Number, sum of places and of their squares, weight and its first moment of a row's samples that count.
 
-    Those with the mark do, and those over `lower` beside one; the three rows of marks begin one before. `taken` gets it.
+    Those with the mark do, and those over `lower` beside one; the three rows of marks begin one before. `taken` gets
+    it.
     """
-    n, x, xx, w, wx = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    n, x, xx, w, wx = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(values)):
-        beside = (above[k] == mark) | (above[k + 1] == mark) | (above[k + 2] == mark) | (here[k] == mark)
-        beside |= (here[k + 2] == mark) | (below[k] == mark) | (below[k + 1] == mark) | (below[k + 2] == mark)
-        over, place = values[k] - lower, np.float32(k)
-        counts = (here[k + 1] == mark) | (beside & (over > _NOTHING))
-        one = np.float32(counts)
-        n += one
-        x += one * place
-        xx += one * place * place
-        w += one * over
-        wx += one * over * place
+        over = values[k] - lower
+        counts = here[k + 1] == mark
+        if not counts and over > _NOTHING:
+            counts = here[k] == mark or here[k + 2] == mark or above[k + 1] == mark or below[k + 1] == mark
+            counts = counts or above[k] == mark or above[k + 2] == mark or below[k] == mark or below[k + 2] == mark
         taken[k] = mark if counts else _NO_MARK
-    return float(n), float(x), float(xx), float(w), float(wx)
+        if counts:
+            n += 1.0
+            x += k
+            xx += k * k
+            w += over
+            wx += over * k
+    return n, x, xx, w, wx
 
 
 @inner

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lumidock._kernels import inner
+from lumidock._kernels import constant, inner
 from lumidock._kernels.tiles import BLOCK
 from lumidock.datatypes import Array, Image, Indices
 
 _NEARLY = 1.0 - 1e-9  # of a margin that rounding may not raise
-_FAR = 4  # tiles at which the slopes of a wide light show
+_BESIDE, _FAR = constant(1), constant(4)  # tiles at which the slopes of a wide light show
 _HALO = 40.0  # sigmas over the background that only the halo of something bright reaches beside its peak
 
 
@@ -78,7 +78,7 @@ def _worth_a_look(
 ) -> bool:
     """Mark the tiles of a part of a row that reach the `least` value and stand on no slope; whether any reach it.
 
-    And that rise over their row by the `margin`, see `_rises`, where it does not end within a few tiles.
+    And, where many do, rise over their row by the `margin`.
     """
     here, limit, mark = peak[i, first:last], least[first:last], worth[: last - first]
     total = np.int32(0)
@@ -89,17 +89,26 @@ def _worth_a_look(
     if total == 0:
         return False
     above, below = peak[max(i - 1, 0), first:last], peak[min(i + 1, len(peak) - 1), first:last]
+    total = np.int32(0)
     for x in range(1, len(here) - 1):
         most = max(np.int32(here[x - 1]) + np.int32(here[x + 1]), np.int32(above[x]) + np.int32(below[x]))
         most = max(most, np.int32(above[x - 1]) + np.int32(below[x + 1]))
         most = max(most, np.int32(above[x + 1]) + np.int32(below[x - 1]))
         mark[x] &= np.int32(2) * np.int32(here[x]) >= most
-    burnt, rise = np.int32(clipped), margin[first:last]
+        total += mark[x]
+    if 8 * total > len(here):  # in a halo many are left, which would be looked at one by one
+        _drop_flat(here, margin[first:last], np.int32(clipped), mark)
+    return True
+
+
+@inner
+def _drop_flat(here: Image, margin: Image, clipped: np.int32, mark: Image) -> None:
+    """Leave only those marks of a row that rise by the `margin`, see `_rises`, or are too near its end to tell."""
     for x in range(_FAR, len(here) - _FAR):
         twice = np.int32(2) * np.int32(here[x])
-        rises = (twice - np.int32(here[x - 1]) - np.int32(here[x + 1]) >= rise[x]) | (np.int32(here[x]) >= burnt)
-        mark[x] &= rises | (twice - np.int32(here[x - _FAR]) - np.int32(here[x + _FAR]) >= rise[x])
-    return True
+        beside = twice - np.int32(here[x - 1]) - np.int32(here[x + 1]) >= margin[x]
+        far = twice - np.int32(here[x - _FAR]) - np.int32(here[x + _FAR]) >= margin[x]
+        mark[x] &= beside | far | (np.int32(here[x]) >= clipped)
 
 
 @inner
@@ -107,12 +116,12 @@ def _stands_out(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
     """Whether a tile is neither on a slope nor on a halo, see `candidates`."""
     if not _rises(peak, i, j, margin, clipped):
         return False
-    near = over_pairs(peak, i, j, 1)
+    near = over_pairs(peak, i, j, _BESIDE)
     if near < 0:
         return False
     if peak[i, j] >= clipped or near >= margin:
         return True
-    for d in range(2, _FAR):  # the top of a wide light, and not every bump on its flanks
+    for d in range(_BESIDE + 1, _FAR):  # the top of a wide light, and not every bump on its flanks
         if over_pairs(peak, i, j, d) < 0:
             return False
     return over_pairs(peak, i, j, _FAR) >= margin

@@ -6,12 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lumidock._kernels import inlined, inner
-from lumidock.datatypes import Array, Image
+from lumidock._kernels import constant, inlined, inner
+from lumidock.datatypes import Array, Frame, Image
 
 RING = 24  # samples on a ring
 COS, SIN = np.cos(np.arange(RING) * 2.0 * np.pi / RING), np.sin(np.arange(RING) * 2.0 * np.pi / RING)
 _ROOT_TWO = np.sqrt(2.0)
+_SIXTEEN = 255.0 / 65535.0  # 8-bit levels of a 16-bit step
+_NONE, _SECOND, _LAST = constant(0), constant(1), constant(5)
 _LEAST_LOST, _SLACK = 0.4, 0.5  # share of its height that a spot loses to the ring; sigmas of noise left to it
 
 
@@ -28,6 +30,16 @@ class Picture(NamedTuple):
     scale: float
     height: int
     width: int
+
+
+def picture(frame: Frame) -> Picture:
+    """A frame as the kernels take it."""
+    image, (height, width) = np.ascontiguousarray(frame.image), frame.image.shape[:2]
+    planes = 4 if frame.encoding.startswith("bayer") else 3 if image.ndim == 3 else 1
+    deep = image.dtype.itemsize
+    return Picture(
+        image.reshape(height, -1).view(np.uint8), deep, planes, 1.0 if deep == 1 else _SIXTEEN, height, width
+    )
 
 
 @inlined
@@ -67,7 +79,7 @@ def ring(picture: Picture, v: int, u: int, radius: float, values: Array) -> int:
 
     Returns how many are.
     """
-    count = 0
+    count = _NONE
     for k in range(0, RING, 2):
         x, y = int(u + radius * COS[k] + 0.5), int(v + radius * SIN[k] + 0.5)
         if 0 <= x < picture.width and 0 <= y < picture.height:
@@ -155,9 +167,7 @@ def stands_out(
 
 
 @inner
-def _pair_level(
-    picture: Picture, p: int, v: int, u: int, radius: float, means: Array
-) -> tuple[float, float, bool]:
+def _pair_level(picture: Picture, p: int, v: int, u: int, radius: float, means: Array) -> tuple[float, float, bool]:
     """Level and scatter of the means of opposite samples on a ring, which no slope moves; whether it is in view."""
     reach = int(radius + 0.5)
     if min(u, v) < reach or u + reach >= picture.width or v + reach >= picture.height:
@@ -166,7 +176,7 @@ def _pair_level(
         x, y = int(np.floor(radius * COS[2 * k] + 0.5)), int(np.floor(radius * SIN[2 * k] + 0.5))
         both = sample(picture, p, v + y, u + x) + sample(picture, p, v - y, u - x)
         insert(means, k, 0.5 * both)
-    return mean(means, 1, 5), _ROOT_TWO * (means[4] - means[1]) / 1.35, True
+    return mean(means, _SECOND, _LAST), _ROOT_TWO * (means[4] - means[1]) / 1.35, True
 
 
 @inner

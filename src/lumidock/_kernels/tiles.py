@@ -15,7 +15,8 @@ from lumidock._kernels.samples import Picture, value
 from lumidock.datatypes import Array, Image, Indices
 
 TILE_PX, BLOCK = 8, 8  # pixels a side of a tile, tiles a side of a block
-EVERY = constant(1)  # step of rows
+_0, _1, _2, _3, _4, _5, _6, _7 = (constant(k) for k in range(8))
+EVERY = _1  # step of rows
 SPARSE = 4  # one block in so many says how samples share their noise
 _LEAST_TOP, TOPS = 160.0, 16  # grey levels: nothing saturates lower, nor so much below the brightest
 _FLAT_TILES, _PLATEAU, _RIPPLE = 4, 6, 5.0  # tiles with so many samples within this much of their largest
@@ -26,10 +27,10 @@ class Map(NamedTuple):
     """What is known of a camera's tiles (h, w) and blocks (hb, wb), in P planes, and scratch.
 
     `peak` (P, h, w) largest values of the tiles; of the blocks `raw_level` (P, hb, wb), `raw_sigma` (hb, wb) and
-    `by_plane` (2, P, hb, wb / 4), see `survey`; from these `level`, `sigma`, `spread` (P,) and `shared` (4,), see
+    `by_plane` (2, P, hb, wb / 4), see `look`; from these `level`, `sigma`, `spread` (P,) and `shared` (4,), see
     `settle`. Scratch: `line` (3, n) bytes, n = 8 w times those of a pixel; `difference` (2, 8 w times the channels);
-    `middle` (9, w) and `ordered` (hb wb + 4,); `top` (TOPS,); `least` (2, w) and `worth` (8 w,) of a row of tiles; `seen` (h, w); `found`
-    (N, 5) and `queue` (2, N).
+    `middle` (9, w) and `ordered` (hb wb + 4,); `top` (TOPS,); `least` (2, w) and `worth` (8 w,) of a row of tiles; `seen` (h, w);
+    `found` (N, 5) and `queue` (2, N).
     """
 
     peak: Image
@@ -69,8 +70,8 @@ def refresh(rows: Image, planes: int, rect: tuple[int, int, int, int], step: int
     for i in range(rect[0], rect[1]):
         top = i * TILE_PX
         if planes == 4:
-            _max_of_four(rows, top, 0, step, left, even[:n])
-            _max_of_four(rows, top, 1, step, left, odd[:n])
+            _max_of_four(rows, top, _0, step, left, even[:n])
+            _max_of_four(rows, top, _1, step, left, odd[:n])
             a, b = peak[0, i, rect[2] : rect[3]], peak[1, i, rect[2] : rect[3]]
             c = peak[2, i, rect[2] : rect[3]]
             _largest_of_corner(even, 0, a)
@@ -83,7 +84,7 @@ def refresh(rows: Image, planes: int, rect: tuple[int, int, int, int], step: int
         if step == 1:
             _max_of_eight(rows, top, left, even[:n])
         else:
-            _max_of_four(rows, top, 0, EVERY, left, even[:n])
+            _max_of_four(rows, top, _0, EVERY, left, even[:n])
         if channels == 1:
             _largest_of_tiles(even, peak[0, i, rect[2] : rect[3]])
         else:
@@ -99,10 +100,10 @@ def _row(rows: Image, top: int, k: int) -> int:
 @inner
 def _max_of_eight(rows: Image, top: int, left: int, line: Image) -> None:
     right = left + len(line)
-    a, b = rows[top, left:right], rows[_row(rows, top, 1), left:right]
-    c, d = rows[_row(rows, top, 2), left:right], rows[_row(rows, top, 3), left:right]
-    e, f = rows[_row(rows, top, 4), left:right], rows[_row(rows, top, 5), left:right]
-    g, h = rows[_row(rows, top, 6), left:right], rows[_row(rows, top, 7), left:right]
+    a, b = rows[top, left:right], rows[_row(rows, top, _1), left:right]
+    c, d = rows[_row(rows, top, _2), left:right], rows[_row(rows, top, _3), left:right]
+    e, f = rows[_row(rows, top, _4), left:right], rows[_row(rows, top, _5), left:right]
+    g, h = rows[_row(rows, top, _6), left:right], rows[_row(rows, top, _7), left:right]
     for x in range(len(line)):
         line[x] = max(max(max(a[x], b[x]), max(c[x], d[x])), max(max(e[x], f[x]), max(g[x], h[x])))
 
@@ -169,7 +170,7 @@ def look(
     peak = known.peak
     h, w = peak.shape[1:]
     for b in range(blocks[0], blocks[1]):
-        refresh(rows, planes, (b * BLOCK, min((b + 1) * BLOCK, h), 0, w), step, peak, line)
+        refresh(rows, planes, (b * BLOCK, min((b + 1) * BLOCK, h), _0, w), step, peak, line)
         for p in range(len(peak)):
             _levels(peak[p], b, known.raw_level[p], known.middle)
         v = min(b * BLOCK * TILE_PX + 3 * TILE_PX, (len(rows) - 2) & -2)
@@ -242,12 +243,12 @@ def _noise(even: Image, odd: Image, planes: int, difference: NDArray[np.int32], 
     for k in range(len(sigma)):
         low = max(min(k * BLOCK * TILE_PX * channels, len(even) - n), 0)
         last = low + n - 2 * step
-        sigma[k] = _SIGMA * _mean(difference[0], low, last, 1)
+        sigma[k] = _SIGMA * _mean(difference[0], low, last, _1)
         if k % SPARSE:
             continue
         for p in range(by_plane.shape[1]):
             if planes == 4:  # corners 0, 2 and 3 of the cell
-                own = _mean(difference[1 if p else 0], (low & -2) + (p == 2), last, 2)
+                own = _mean(difference[1 if p else 0], (low & -2) + (p == 2), last, _2)
             else:
                 own = _mean(difference[0], low + p, last, channels) if channels > 1 else sigma[k] / _SIGMA
                 by_plane[1, p, k // SPARSE] = _SIGMA * _second_difference_of_sums(even[low + p : low + n : channels])
@@ -364,13 +365,16 @@ def _second_difference_of_sums(row: Image) -> float:
 
 @inner
 def _median(values: Array, ordered: Array) -> float:
-    """The upper median of `values` (m, n), which are put into `ordered`."""
-    count = 0
+    """The median of `values` (m, n), which are put into `ordered`."""
+    count = _0
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             ordered[count] = values[i, j]
             count += 1
-    return float(select(ordered, count, count // 2))
+    upper, lower = select(ordered, count, count // 2), -np.inf
+    for k in range(count // 2):
+        lower = max(lower, ordered[k])
+    return upper if count % 2 else 0.5 * (lower + upper)
 
 
 @inner
