@@ -36,7 +36,7 @@ _OUTPUT = {
     "bayer_rggb8": ("output.pixels=bayer8", "output.file=png"),
     "bgr8": (),
 }
-_OTHERS = np.zeros(1 << 26, np.uint8)
+_OTHERS = np.ones(1 << 26, np.uint8)  # zeros that nobody wrote are one page
 Times = dict[str, list[float]]
 
 

@@ -8,6 +8,7 @@ import pytest
 from bench.shipped import shipped_camera, shipped_station
 
 from lumidock import detect, layers
+from lumidock._kernels.detect import see
 from lumidock.config import DetectConfig, LabelConfig
 from lumidock.datatypes import MOSAICS, Attitude, Frame
 from lumidock.sim.scenario import load_scenario, trajectory
@@ -283,6 +284,17 @@ def test_every_format_gives_the_same_lights(kind, rng):
     distance = np.linalg.norm(lamps[:, None] - places[None], axis=2)
     assert len(lamps) == 3
     assert distance.min(axis=0).max() < 0.12
+
+
+def test_one_compiled_search_takes_every_type_of_pixels(rng):
+    image = canvas(rng, (64, 80))
+    add_spot(image, 40.3, 30.6)
+    for kind in FORMATS:
+        for writeable in (True, False):  # as pictures from files are, and those in messages
+            frame = as_format(image, kind)
+            frame.image.flags.writeable = writeable
+            assert len(detect.lights(frame, CONFIG)) == 1, kind
+    assert len(see.signatures) == 1
 
 
 @pytest.mark.parametrize("order", MOSAICS)

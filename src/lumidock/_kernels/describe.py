@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import fields, gauss, inner, patch, samples, summing
+from lumidock._kernels import fields, gauss, inner, patch, region, samples, summing
 from lumidock._kernels.patch import CloseUp
 from lumidock._kernels.samples import Picture
 from lumidock.datatypes import Array, Image
@@ -50,12 +50,12 @@ def describe(
         room = gauss.REACH + 3.0 if small else 0.0
         patch.cut(picture, v, u, max(1.6 * radius + 3.0, room), patch.SIDE, close)
         peak_value(close)
-        patch.grow(picture, close, level, q[fields.CLIPPED])
-    variance = ground[patch.NOISE] ** 2 + q[fields.SIGNAL_NOISE] * max(sums[patch.W] / sums[patch.N], 0.0)
-    cut_off = sums[patch.EDGE] > 0.0
+        region.grow(picture, close, level, q[fields.CLIPPED])
+    variance = ground[patch.NOISE] ** 2 + q[fields.SIGNAL_NOISE] * max(sums[region.W] / sums[region.N], 0.0)
+    cut_off = sums[region.EDGE] > 0.0
     edge = _edge(close, floor + _PLATEAU * (top - floor))
     lower = level - _SOFT * (top - floor) * min(max(_BROAD_PX - edge, 0.0), 1.0)
-    between_u, between_v = patch.soften(close, lower)
+    between_u, between_v = region.soften(close, lower)
     center, cov = _balanced(close, variance * gauss.averaging(ground[patch.SHARED], radius), mosaic, lower)
     grid = _GRID_OF_MOSAIC if mosaic else _GRID
     noise_of_balance = cov[0] + cov[2] + 2.0 * (grid * where[patch.UNIT]) ** 2
@@ -86,7 +86,7 @@ def describe(
 def _balanced(close: CloseUp, variance: float, mosaic: bool, lower: float) -> tuple[Center, Cov]:
     """The balance of the region with its soft edge, over `lower`, and its covariance by noise of a `variance`."""
     where, unit = close.where, float(close.where[patch.UNIT])
-    x, y, xx, xy, yy = patch.balance(close.sums, variance)
+    x, y, xx, xy, yy = region.balance(close.sums, variance)
     shift_u, shift_v = _plane_shift(close, lower) if mosaic else (0.0, 0.0)
     u = where[patch.LEFT] + unit * (where[patch.START_X] + x) + shift_u
     v = where[patch.TOP] + unit * (where[patch.START_Y] + y) + shift_v
@@ -118,10 +118,10 @@ def _with_skew(
 
     That is how far the centre moves when the spot is cut out higher.
     """
-    patch.grow(picture, close, higher, q[fields.CLIPPED])
+    region.grow(picture, close, higher, q[fields.CLIPPED])
     unit, skewed = float(close.where[patch.UNIT]), (0.0, 0.0, 0.0)
-    if close.sums[patch.N] >= 4.0:
-        patch.soften(close, higher - soft)
+    if close.sums[region.N] >= 4.0:
+        region.soften(close, higher - soft)
         other, _ = _balanced(close, 1.0, picture.planes == 4, higher - soft)
         # the higher region is a part of the lower one, so that half of their noise is common
         common = 0.5 * (cov[0] + cov[2] + 2.0 * (_GRID * unit) ** 2)
@@ -135,17 +135,17 @@ def _with_skew(
 def _size(close: CloseUp, level: float, shared: float, spot: Array) -> None:
     """What the region grown at `level` says of a spot: all but its exact centre and covariance."""
     sums, where, ground, unit = close.sums, close.where, close.ground, float(close.where[patch.UNIT])
-    area = sums[patch.N]
-    x, y = where[patch.START_X] + sums[patch.X] / area, where[patch.START_Y] + sums[patch.Y] / area
+    area = sums[region.N]
+    x, y = where[patch.START_X] + sums[region.X] / area, where[patch.START_Y] + sums[region.Y] / area
     spot[fields.U], spot[fields.V] = where[patch.LEFT] + unit * x, where[patch.TOP] + unit * y
     spot[fields.RADIUS] = np.sqrt(area / np.pi) * unit
-    flux = sums[patch.W] + area * (level - ground[patch.LEVEL])
+    flux = sums[region.W] + area * (level - ground[patch.LEVEL])
     spot[fields.FLUX] = flux * unit * unit
     spot[fields.SNR] = flux / (area * np.sqrt(shared * ground[patch.NOISE] ** 2 / area + ground[patch.HIDES] ** 2))
     if spot[fields.RADIUS] < _FILTERED_PX:
         spot[fields.SNR] = small_snr(close, x, y, max(FILTER_PX / unit, 0.7), shared)
-    spot[fields.ELONGATION], spot[fields.FILL] = patch.shape(sums)
-    spot[fields.SATURATED], spot[fields.CUT] = sums[patch.CLIPPED] / area, sums[patch.EDGE] / area
+    spot[fields.ELONGATION], spot[fields.FILL] = region.shape(sums)
+    spot[fields.SATURATED], spot[fields.CUT] = sums[region.CLIPPED] / area, sums[region.EDGE] / area
 
 
 @inner
@@ -207,9 +207,9 @@ def holds_another(close: CloseUp, spots: Array, n: int) -> bool:
 def _around(close: CloseUp) -> float:
     """Mean level over the floor on a circle around a region's centre, of twice its radius."""
     sums, where, total, count = close.sums, close.where, 0.0, 0
-    radius = 2.0 * np.sqrt(sums[patch.N] / np.pi) + 1.0
-    x = where[patch.START_X] + sums[patch.X] / sums[patch.N]
-    y = where[patch.START_Y] + sums[patch.Y] / sums[patch.N]
+    radius = 2.0 * np.sqrt(sums[region.N] / np.pi) + 1.0
+    x = where[patch.START_X] + sums[region.X] / sums[region.N]
+    y = where[patch.START_Y] + sums[region.Y] / sums[region.N]
     for k in range(0, samples.RING, 2):
         a, b = int(x + radius * samples.COS[k] + 0.5), int(y + radius * samples.SIN[k] + 0.5)
         if 0 <= a < where[patch.COLUMNS] and 0 <= b < where[patch.ROWS]:
@@ -227,10 +227,10 @@ def _plane_shift(close: CloseUp, level: float) -> Center:
     place.
     """
     weight, sums, where, mark = close.weight, close.sums, close.where, np.int32(close.where[patch.MARK])
-    left = max(int(sums[patch.FIRST_COLUMN]) - 1, 1)
-    right = min(int(sums[patch.LAST_COLUMN]) + 2, where[patch.COLUMNS] - 1)
-    upper = max(int(sums[patch.FIRST_ROW]) - 1, 1)
-    down = min(int(sums[patch.LAST_ROW]) + 2, where[patch.ROWS] - 1)
+    left = max(int(sums[region.FIRST_COLUMN]) - 1, 1)
+    right = min(int(sums[region.LAST_COLUMN]) + 2, where[patch.COLUMNS] - 1)
+    upper = max(int(sums[region.FIRST_ROW]) - 1, 1)
+    down = min(int(sums[region.LAST_ROW]) + 2, where[patch.ROWS] - 1)
     t = close.rings  # rows: planes; columns: all inside, those of them at the rim, those outside at the rim
     t[:5, :3] = 0.0
     ones = close.lines[0, : max(right - left, 0)]
@@ -284,13 +284,13 @@ def _edge(close: CloseUp, high: float) -> float:
     In the picture as it is, for the close-up may be smoothed. Infinite for a wide spot.
     """
     sums, where, mark = close.sums, close.where, np.int32(close.where[patch.MARK])
-    area, unit, inside = sums[patch.N], float(where[patch.UNIT]), _NO
+    area, unit, inside = sums[region.N], float(where[patch.UNIT]), _NO
     if area * unit * unit > _WIDEST_PX2:
         return np.inf
-    left, right = int(sums[patch.FIRST_COLUMN]), int(sums[patch.LAST_COLUMN]) + 1
+    left, right = int(sums[region.FIRST_COLUMN]), int(sums[region.LAST_COLUMN]) + 1
     w0, w1 = np.float32(close.weight[0]), np.float32(close.weight[1])
     w2, w3, limit = np.float32(close.weight[2]), np.float32(close.weight[3]), np.float32(high)
-    for i in range(int(sums[patch.FIRST_ROW]), int(sums[patch.LAST_ROW]) + 1):
+    for i in range(int(sums[region.FIRST_ROW]), int(sums[region.LAST_ROW]) + 1):
         marks, a, b = (
             close.stamp[i + 1, left + 1 : right + 1],
             close.stack[0, i, left:right],
@@ -324,9 +324,13 @@ def _disagreement(du: float, dv: float, expected: float) -> Cov:
 @inner
 def _unresolved(sums: Array, q: Array, unit: float) -> Cov:
     """Covariance of a region too long for one light: two that are not told apart, and either may be the one meant."""
-    uu, uv, vv = patch.moments(sums)
+    uu, uv, vv = region.moments(sums)
     half, turn = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
-    if sums[patch.N] < 12.0 or np.sqrt(max(half - turn, 0.0) / (half + turn)) > q[fields.MIN_ELONGATION] or turn <= 0.0:
+    if (
+        sums[region.N] < 12.0
+        or np.sqrt(max(half - turn, 0.0) / (half + turn)) > q[fields.MIN_ELONGATION]
+        or turn <= 0.0
+    ):
         return 0.0, 0.0, 0.0
     excess = unit * unit
     return excess * (turn + 0.5 * (uu - vv)), excess * uv, excess * (turn - 0.5 * (uu - vv))

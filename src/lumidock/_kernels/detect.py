@@ -23,6 +23,7 @@ _NO_LIMIT = 1 << 16  # of a sample
 _NO_CANDIDATE = 1 << 20  # more than there are
 _OF_TILE = tiles.TILE_PX * tiles.TILE_PX
 _LAST_OF_TILE = _OF_TILE - 1
+_WHITE = _OF_TILE * 255  # nothing is brighter in 8 bits
 _NONE = _STAY = constant(0)
 _STEP = constant(1)  # along rows or columns
 _SWEPT_STEP = constant(2)  # of rows, in a tracked search's sweep: the smallest spot still has half its height
@@ -213,6 +214,8 @@ def _brightest(picture: Picture, p: int, i: int, j: int) -> tuple[int, int, int]
             line = picture.rows[v]
             for u in range(first, right, step):
                 best = max(best, _OF_TILE * int(line[u]) + after - u)
+            if best >= _WHITE:
+                break
         else:
             for u in range(first, right, step):
                 best = max(best, _OF_TILE * _rank(picture, p, v, u) + after - u)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import constant, fields, inner, patch, peaks, samples, tiles
+from lumidock._kernels import constant, fields, inner, patch, peaks, region, samples, tiles
 from lumidock._kernels.describe import FILTER_PX, describe, holds_another, peak_value, small_snr
 from lumidock._kernels.patch import CloseUp
 from lumidock._kernels.samples import Picture
@@ -38,18 +38,10 @@ def measure(
 ) -> int:
     """Measure the spot of one candidate tile into `spots[n]`: 1 if there is one, 0 if not, -1 if that was cheap."""
     (i, j), planes, weight, ground = tile, picture.planes, close.weight, close.ground
-    radius, clipped = 0.0, picture.scale * peaks.largest(known.peak, i, j) >= q[fields.CLIPPED]
-    if clipped:
-        radius = samples.weigh_clipped(picture, v, u, _LEAST_STEP, q[fields.MAX_RADIUS_PX], weight, close.rings)
-        if radius == 0.0:
-            return -1
-    else:
-        radius = min(_extent(known.peak, i, j, known.level), q[fields.MAX_RADIUS_PX])
-        sigma = noise * np.sqrt(known.shared[p])
-        plane, small, ring = p + (p == 2 and planes == 4), radius < tiles.TILE_PX, max(radius, q[fields.RING_PX])
-        if not samples.stands_out(picture, plane, v, u, ring, sigma, _QUICK, small, close.rings[0]):
-            return -1
-        samples.weigh(picture, v, u, radius, weight, close.rings)
+    clipped = picture.scale * peaks.largest(known.peak, i, j) >= q[fields.CLIPPED]
+    radius = _radius(picture, known, close, tile, v, u, p, noise, clipped, q)
+    if radius == 0.0:
+        return -1
     shared = samples.mean_by_square(weight, known.shared, 1)
     expected = noise * np.sqrt(samples.square(weight))
     share, reach = 0.0, min(max(3.5 * radius, 1.5 * q[fields.RING_PX]), 3.5 * q[fields.MAX_RADIUS_PX])
@@ -68,19 +60,19 @@ def measure(
             if not clipped:
                 _own(known.seen, close)
                 return 0
-            if close.sums[patch.OPEN] == 0.0 or reach >= 3.5 * q[fields.MAX_RADIUS_PX]:
+            if close.sums[region.OPEN] == 0.0 or reach >= 3.5 * q[fields.MAX_RADIUS_PX]:
                 _own_plateau(picture, close, v, u, reach, q, known.seen)
                 return 0
             reach = min(2.0 * reach, 3.5 * q[fields.MAX_RADIUS_PX])
             continue
-        found = np.sqrt(close.sums[patch.N] / np.pi) * close.where[patch.UNIT]
+        found = np.sqrt(close.sums[region.N] / np.pi) * close.where[patch.UNIT]
         wanted = min(max(3.5 * found, 1.5 * q[fields.RING_PX]), 3.5 * q[fields.MAX_RADIUS_PX])
         if 0.6 * reach <= wanted <= 1.25 * reach or turn == _ROUNDS - 1:
             break
         reach = wanted
     if share == 0.0:
         return 0
-    if np.sqrt(close.sums[patch.N] / np.pi) * close.where[patch.UNIT] > q[fields.MAX_RADIUS_PX]:
+    if np.sqrt(close.sums[region.N] / np.pi) * close.where[patch.UNIT] > q[fields.MAX_RADIUS_PX]:
         _own_plateau(picture, close, v, u, reach, q, known.seen)  # lights may stand in its halo
         return 0
     _own(known.seen, close)
@@ -98,6 +90,31 @@ def measure(
             picture, v, u, q[fields.RING_PX], around, noise, close.rings
         )
     return int(describe(picture, close, u, v, share, shared, q, spots, n))
+
+
+@inner
+def _radius(
+    picture: Picture,
+    known: tiles.Map,
+    close: CloseUp,
+    tile: tuple[int, int],
+    v: int,
+    u: int,
+    p: int,
+    noise: float,
+    clipped: bool,
+    q: Array,
+) -> float:
+    """Radius px that a candidate seems to have, for which the planes are weighed; 0 if it does not stand out."""
+    if clipped:
+        return samples.weigh_clipped(picture, v, u, _LEAST_STEP, q[fields.MAX_RADIUS_PX], close.weight, close.rings)
+    radius = min(_extent(known.peak, tile[0], tile[1], known.level), q[fields.MAX_RADIUS_PX])
+    plane, small = p + (p == 2 and picture.planes == 4), radius < tiles.TILE_PX
+    ring, sigma = max(radius, q[fields.RING_PX]), noise * np.sqrt(known.shared[p])
+    if not samples.stands_out(picture, plane, v, u, ring, sigma, _QUICK, small, close.rings[0]):
+        return 0.0
+    samples.weigh(picture, v, u, radius, close.weight, close.rings)
+    return radius
 
 
 @inner
@@ -150,21 +167,21 @@ def _level(picture: Picture, close: CloseUp, q: Array, spots: Array, n: int) -> 
     """
     top, floor, sums, fallback = peak_value(close), close.ground[patch.LEVEL], close.sums, 0.0
     if top <= floor:
-        patch.take_all(close)
+        region.take_all(close)
         return 0.0
     for k in range(1 if picture.planes == 1 and top >= q[fields.CLIPPED] else 0, len(LEVELS) + 1):
         again = k == len(LEVELS)
         if again and fallback == 0.0:
             return 0.0
         share = fallback if again else LEVELS[k]
-        patch.grow(picture, close, floor + share * (top - floor), q[fields.CLIPPED])
+        region.grow(picture, close, floor + share * (top - floor), q[fields.CLIPPED])
         if holds_another(close, spots, n):
-            sums[patch.OPEN] = 0.0  # a wider window does not help
+            sums[region.OPEN] = 0.0  # a wider window does not help
             continue
-        if sums[patch.OPEN] > 0.0:
+        if sums[region.OPEN] > 0.0:
             continue
-        elongation, fill = patch.shape(sums)
-        if again or sums[patch.N] < 12.0 or (elongation > q[fields.MIN_ELONGATION] and fill > q[fields.MIN_FILL]):
+        elongation, fill = region.shape(sums)
+        if again or sums[region.N] < 12.0 or (elongation > q[fields.MIN_ELONGATION] and fill > q[fields.MIN_FILL]):
             return share
         if fallback == 0.0:
             fallback = share
@@ -175,9 +192,9 @@ def _level(picture: Picture, close: CloseUp, q: Array, spots: Array, n: int) -> 
 def _own(seen: Image, close: CloseUp) -> None:
     """Mark the tiles that the grown region touches: nobody looks there again."""
     stamp, sums, where, t = close.stamp, close.sums, close.where, tiles.TILE_PX
-    mark, unit, columns = np.int32(where[patch.MARK]), where[patch.UNIT], int(sums[patch.LAST_COLUMN]) + 1
-    for y in range(int(sums[patch.FIRST_ROW]), int(sums[patch.LAST_ROW]) + 1):
-        line, x = stamp[y + 1], int(sums[patch.FIRST_COLUMN])
+    mark, unit, columns = np.int32(where[patch.MARK]), where[patch.UNIT], int(sums[region.LAST_COLUMN]) + 1
+    for y in range(int(sums[region.FIRST_ROW]), int(sums[region.LAST_ROW]) + 1):
+        line, x = stamp[y + 1], int(sums[region.FIRST_COLUMN])
         top = where[patch.TOP] + y * unit
         last_row = min((top + unit - 1) // t + 1, seen.shape[0])
         while x < columns:
@@ -203,7 +220,7 @@ def _own_plateau(picture: Picture, close: CloseUp, v: int, u: int, reach: float,
     close.weight[:] = 0.0
     close.weight[darkest] = 1.0
     patch.cut(picture, v, u, reach, patch.COARSE_SIDE, close)
-    patch.grow(picture, close, LEVELS[-1] * least, q[fields.CLIPPED])
+    region.grow(picture, close, LEVELS[-1] * least, q[fields.CLIPPED])
     for p in range(picture.planes):
-        patch.unmark(close, p, LEVELS[-1] * samples.core_mean(picture, p, v, u))
+        region.unmark(close, p, LEVELS[-1] * samples.core_mean(picture, p, v, u))
     _own(seen, close)

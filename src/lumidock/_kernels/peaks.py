@@ -57,13 +57,13 @@ def candidates(
             for j in range(rect[2] + 8 * part, min(rect[2] + 8 * part + 8, rect[3])):
                 if not worth[j - rect[2]] or seen[i, j] or count == len(found):
                     continue
+                if peak[i, j] >= clipped and _is_inner(together, i, j, int(clipped)):
+                    continue
                 here, over = spread * sigma[b, j // BLOCK], peak[i, j] - level[b, j // BLOCK]
                 if not _rises(peak, i, j, margin[j], int(clipped)):
                     continue
                 local = np.sqrt(here * here + shot * max(over - _HALO * here, 0.0))
                 if not _stands_out(peak, i, j, max(int(1.5 * contrast * local), 2), int(clipped)):
-                    continue
-                if peak[i, j] >= clipped and _is_inner(together, i, j, int(clipped)):
                     continue
                 seen[i, j] = 1
                 found[count, 0], found[count, 1] = i, j

@@ -37,9 +37,9 @@ def picture(frame: Frame) -> Picture:
     image, (height, width) = np.ascontiguousarray(frame.image), frame.image.shape[:2]
     planes = 4 if frame.encoding.startswith("bayer") else 3 if image.ndim == 3 else 1
     deep = image.dtype.itemsize
-    return Picture(
-        image.reshape(height, -1).view(np.uint8), deep, planes, 1.0 if deep == 1 else _SIXTEEN, height, width
-    )
+    rows = image.reshape(height, -1).view(np.uint8)
+    rows.flags.writeable = False  # or what is read only, as messages are, would be of another type, compiled anew
+    return Picture(rows, deep, planes, 1.0 if deep == 1 else _SIXTEEN, height, width)
 
 
 @inlined

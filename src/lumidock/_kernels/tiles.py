@@ -29,8 +29,8 @@ class Map(NamedTuple):
     `peak` (P, h, w) largest values of the tiles; of the blocks `raw_level` (P, hb, wb), `raw_sigma` (hb, wb) and
     `by_plane` (2, P, hb, wb / 4), see `look`; from these `level`, `sigma`, `spread` (P,) and `shared` (4,), see
     `settle`. Scratch: `line` (3, n) bytes, n = 8 w times those of a pixel; `difference` (2, 8 w times the channels);
-    `middle` (9, w) and `ordered` (hb wb + 4,); `top` (TOPS,); `least` (2, w) and `worth` (8 w,) of a row of tiles; `seen` (h, w);
-    `found` (N, 5) and `queue` (2, N).
+    `middle` (9, w), `ordered` (hb wb + 4,) and `top` (TOPS,); `least` (2, w) and `worth` (8 w,) of a row of tiles;
+    `seen` (h, w); `found` (N, 5) and `queue` (2, N).
     """
 
     peak: Image
