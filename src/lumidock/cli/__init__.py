@@ -309,7 +309,7 @@ def _warm() -> None:
 
     dock = load_station(shipped_or_path("station", DEFAULT_STATION))
     lens = load_camera(shipped_or_path("camera", DEFAULT_CAMERA))
-    print("compiling detection and matching, a minute or two ...", flush=True)
+    print("compiling detection and matching, half a minute or so ...", flush=True)
     compile_ahead(dock, lens)
     for name, _ in warm_up(Localizer(dock, lens).process, dock, lens):
         print(f"ready for {name}", flush=True)
