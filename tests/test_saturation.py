@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lumidock import detect
+from lumidock._kernels.saturation import SATURATED
 from lumidock.config import DetectConfig
 from lumidock.datatypes import Frame
 
@@ -47,13 +48,13 @@ def test_lights_that_are_not_saturated_pile_up_nowhere(count, rng):
     rows, columns = np.indices(image.shape)
     for u, v in rng.uniform((20.0, 20.0), (620.0, 460.0), (count, 2)):
         image += 190.0 * np.exp(-0.5 * ((columns - u) ** 2 + (rows - v) ** 2) / 1.3**2)
-    assert seen(np.minimum(image, 245.0))[1] == detect.SATURATED
+    assert seen(np.minimum(image, 245.0))[1] == SATURATED
 
 
 def test_bright_water_is_not_saturated(rng):
     image = rng.normal(200.0, 2.0, (240, 320))
-    assert seen(image)[1] == detect.SATURATED
+    assert seen(image)[1] == SATURATED
     rows, columns = np.indices(image.shape)
     for u, v in PLACES:
         image += 40.0 * np.exp(-0.5 * ((columns - u) ** 2 + (rows - v) ** 2) / 3.0**2)
-    assert seen(image)[1] == detect.SATURATED
+    assert seen(image)[1] == SATURATED

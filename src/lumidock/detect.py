@@ -20,10 +20,10 @@ import numpy as np
 from lumidock._kernels import detect as kernels
 from lumidock._kernels import fields, patch, tiles
 from lumidock._kernels.samples import picture
+from lumidock._kernels.saturation import SATURATED
 from lumidock.config import DetectConfig
 from lumidock.datatypes import Array, Detections, Frame
 
-SATURATED = 250.0  # of 255, in a picture that uses them all
 _TWELVE_BITS = 16.0  # steps of a sensor of 12 bits in 16
 SWEEP = kernels.SWEEP
 _LEAST_SIDE = 4  # pixels; in less nothing stands out
@@ -100,8 +100,7 @@ def _parameters(config: DetectConfig, longer_side: int, least_noise: float, line
     q[fields.FLOOR_PX], q[fields.TEXTURE] = config.floor_px, config.texture
     q[fields.SATURATED_PX], q[fields.CUT_SHARE] = config.saturated_px, config.cut
     q[fields.GLINT_RADII], q[fields.GLINT_RATIO] = config.glint_radii, config.glint_ratio
-    q[fields.GLINT_TRUST], q[fields.FULL], q[fields.MIN_NOISE] = config.glint_trust, SATURATED, least_noise
-    q[fields.CLIPPED] = SATURATED  # until a frame shows otherwise
+    q[fields.GLINT_TRUST], q[fields.CLIPPED], q[fields.MIN_NOISE] = config.glint_trust, SATURATED, least_noise
     q[fields.PROMINENT], q[fields.COARSE_PX] = config.prominent, config.coarse_px
     q[fields.KIN], q[fields.LAMPS], q[fields.RANGE] = config.kin, config.lamps, config.flux_range
     return q

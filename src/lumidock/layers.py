@@ -9,9 +9,9 @@ import numpy as np
 
 from lumidock._kernels.colors import colors
 from lumidock._kernels.samples import picture
+from lumidock._kernels.saturation import SATURATED
 from lumidock.config import LabelConfig
 from lumidock.datatypes import Array, Detections, Frame, Indices
-from lumidock.detect import SATURATED
 
 _OF_LETTER = {"b": 0, "g": 1, "r": 2}
 _LINEAR = np.empty(0, np.float32)  # raw mosaics are

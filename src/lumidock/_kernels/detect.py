@@ -13,6 +13,7 @@ from lumidock._kernels.likelihood import dim_glints, dim_small_fry, lamp_probabi
 from lumidock._kernels.measure import measure
 from lumidock._kernels.patch import CloseUp
 from lumidock._kernels.samples import Picture
+from lumidock._kernels.saturation import saturation
 from lumidock.datatypes import Array, Indices
 
 SWEEP = 8  # frames in which a tracked search has seen everything
@@ -73,7 +74,7 @@ def see(
         wide, line = picture.rows.view(np.uint16), known.line.view(np.uint16)
         tiles.look(wide, line, planes, (first, last), step, rects, count, known)
     if whole or part == SWEEP - 1:
-        q[fields.CLIPPED] = tiles.saturation(picture, known, q[fields.FULL])
+        q[fields.CLIPPED] = saturation(picture, known)
         tiles.settle(known, q[fields.MIN_NOISE] / picture.scale, 1.0 if planes == 4 else _MOST_SHARED)
     rects = rects[: count + 1]
     count = _candidates(picture, known, rects, most[0], q)

@@ -50,6 +50,5 @@ COLUMNS = 17
     PROMINENT,
     COARSE_PX,
     TEXTURE,
-    FULL,
-) = range(24)
-PARAMETERS = 24
+) = range(23)
+PARAMETERS = 23
