@@ -84,3 +84,15 @@ def test_a_cold_localizer_forgets_which_spots_were_there(rng):
     alone = cold.process(Frame("0", 0, image)).match.detections.p_light
     cold.process(Frame("1", STEP_NS, blank))
     assert (cold.process(Frame("2", 2 * STEP_NS, image)).match.detections.p_light == alone).all()
+
+
+def test_a_localizer_that_forgets_does_so_in_the_picture_too(rng):
+    camera = shipped_camera()
+    image = np.full((camera.height, camera.width), 20, np.uint8)
+    blank = image.copy()
+    image[:240, :320] = picture(rng, SPOTS)
+    localizer = Localizer(shipped_station(), camera)
+    alone = localizer.process(Frame("0", 0, image)).match.detections.p_light
+    localizer.process(Frame("1", STEP_NS, blank))
+    localizer.forget()
+    assert (localizer.process(Frame("2", 2 * STEP_NS, image)).match.detections.p_light == alone).all()

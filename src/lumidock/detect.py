@@ -83,6 +83,10 @@ class Scan:
         """The grey level, of 255, from which on samples are saturated in the frames that were seen."""
         return float(self.q[fields.CLIPPED])
 
+    def forget(self) -> None:
+        """Drop what the frame before says of which spots are steady."""
+        self.t_ns = None
+
     def since(self, t_ns: int, config: DetectConfig) -> tuple[float, bool]:
         """How far, px, a lamp may have moved since the frame before, 0 if that is too long ago; whether it saw all."""
         dt_s = (t_ns - self.t_ns) * 1e-9 if self.t_ns is not None else 0.0

@@ -55,6 +55,8 @@ class Localizer:
         self._last: Detections | None = None
         self._slow: tuple[Array, Array] | None = None
         self._ahead: _Ahead | None = None
+        if self.scan is not None:
+            self.scan.forget()
 
     def process(self, frame: Frame) -> Fix:
         """Image door. Raises: FrameError when the image is not of the camera's size."""
@@ -64,8 +66,6 @@ class Localizer:
             raise FrameError("bad_frame", f"frame {frame.name} is {width}x{height}, the calibration {wanted}")
         if self.scan is None or not self.scan.fits(frame):
             self.scan = detect.Scan(frame, self.config.detect)
-        if self.cold:
-            self.scan.t_ns = None
         detections = detect.lights(frame, self.config.detect, self.scan, self.foreseen(frame))
         return self.process_detections(layers.label(frame, detections, self.config.label, self.scan.saturated))
 
