@@ -10,8 +10,8 @@ import numpy as np
 
 from bench.shipped import shipped_camera, shipped_station
 from lumidock.datatypes import Image
-from lumidock.sim.plan import plan_of
 from lumidock.sim.scenario import R_DOCK_CAM_HEAD_ON, load_scenario
+from lumidock.sim.schedule import schedule_of
 
 SHEET = Path("docs/contact-sheet.jpg")
 ROWS = {
@@ -30,7 +30,7 @@ _MARGIN, _DOCK_M = 1.7, 2.0  # of the dock's size, which fills each tile
 def picture(scenario: str, z_m: float) -> Image:
     """A frame (2048, 2448, 3) from `z_m` before the dock, on its axis."""
     station = shipped_station()
-    plan = plan_of(load_scenario(scenario), station, shipped_camera(), 0)
+    plan = schedule_of(load_scenario(scenario), station, shipped_camera(), 0)
     T_dock_cam = np.eye(4)
     T_dock_cam[:3, :3], T_dock_cam[2, 3] = R_DOCK_CAM_HEAD_ON, z_m
     moment = replace(plan.moment(0), t_s=30.0 - z_m, T_dock_cam=T_dock_cam, T_cam_later=np.eye(4))

@@ -58,7 +58,7 @@ def measure(folder: Path) -> dict[str, float]:
     config = Config()
     seen = dict.fromkeys(_SNRS, 0)
     wanted = dict.fromkeys(_SNRS, 0)
-    lamps_low, false, false_apart, frames, spots = 0, 0, 0, 0, 0
+    lamps_low, false, false_apart, frames, detections = 0, 0, 0, 0, 0
     errors: dict[str, list[float]] = defaultdict(list)
     nees: dict[str, list[float]] = defaultdict(list)
     rear: list[bool] = []
@@ -71,7 +71,7 @@ def measure(folder: Path) -> dict[str, float]:
         lit = [row for row in truth[frame.name] if float(row["snr"] or 0) > 4.0]
         lit_uv = np.array([[float(row["u_px"]), float(row["v_px"])] for row in lit]).reshape(-1, 2)
         owner = matches(found, lit_uv)
-        frames, spots = frames + 1, spots + len(found)
+        frames, detections = frames + 1, detections + len(found)
         snr = np.array([float(row["snr"]) for row in lit])
         for least in _SNRS:
             wanted[least] += int((snr > least).sum())
@@ -93,7 +93,7 @@ def measure(folder: Path) -> dict[str, float]:
             if np.isfinite(found.p_rear[i]):
                 rear.append((found.p_rear[i] > 0.5) == row["light"].startswith("R"))
     figures = {f"recall>{least:g}": 100.0 * seen[least] / max(wanted[least], 1) for least in _SNRS}
-    figures |= {"false": false / frames, "apart": false_apart / frames, "spots": spots / frames}
+    figures |= {"false": false / frames, "apart": false_apart / frames, "detections": detections / frames}
     figures |= {"lamps with p<0.5": lamps_low / frames, "layer right": float(np.mean(rear)) if rear else float("nan")}
     for kind in sorted(errors):
         e, n = np.array(errors[kind]), np.array(nees[kind])
@@ -143,8 +143,8 @@ def main() -> tuple[dict[str, object], list[str]]:
         with TemporaryDirectory() as name:
             simulate(scenario, _SEED, Path(name) / "s")
             content[scenario] = measure(Path(name) / "s")
-    columns = ("recall>12", "recall>8", "false", "apart", "spots")
-    names = ("found, SNR > 12, %", "> 8, %", "false", "glints, snow, ...", "all spots")
+    columns = ("recall>12", "recall>8", "false", "apart", "detections")
+    names = ("found, SNR > 12, %", "> 8, %", "false", "glints, snow, ...", "all detections")
     lines = ["| scenario | " + " | ".join(names) + " |", "|---" * (len(columns) + 1) + "|"]
     for scenario, figures in content.items():
         assert isinstance(figures, dict)

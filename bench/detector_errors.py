@@ -16,14 +16,15 @@ import numpy as np
 
 from bench.detection import matches
 from bench.shipped import PACKAGE, shipped_camera, shipped_station
-from lumidock import detect, layers, page
+from lumidock import detect, layers
 from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Frame, Indices
+from lumidock.report import page
 from lumidock.reproduce.detector import detector_table
 from lumidock.sim.frames import Shot
 from lumidock.sim.measured import KINDS, TABLE, measured_table, same_picture
-from lumidock.sim.plan import Plan, exposed, plan_of
 from lumidock.sim.scenario import Scenario, load_scenario, shipped_scenarios
+from lumidock.sim.schedule import Plan, exposed, schedule_of
 from lumidock.sim.sequence import encoded
 from lumidock.streams.images import decode_image
 
@@ -40,16 +41,16 @@ class Cell:
     """Lights of a kind in a band, or frames, those seen, and rows of sigma px, error over it, p_light and p_rear."""
 
     of: int = 0
-    spots: list[list[float]] = field(default_factory=list)
+    detections: list[list[float]] = field(default_factory=list)
 
     def as_dict(self, most: int) -> dict[str, Any]:
         """For the file: spots by rising error, false ones by p_light, thinned out evenly to `most`."""
-        rows = sorted(self.spots, key=lambda row: row[1:3])
+        rows = sorted(self.detections, key=lambda row: row[1:3])
         if len(rows) > most:
             rows = [rows[i] for i in np.linspace(0, len(rows) - 1, most).round().astype(int)]
         kept = [[None if np.isnan(value) else float(f"{value:.3g}") for value in row] for row in rows]
-        square = float(np.mean([row[1] ** 2 for row in self.spots])) if self.spots else 0.0
-        return {"of": self.of, "seen": len(self.spots), "mean_square": float(f"{square:.3g}"), "spots": kept}
+        square = float(np.mean([row[1] ** 2 for row in self.detections])) if self.detections else 0.0
+        return {"of": self.of, "seen": len(self.detections), "mean_square": float(f"{square:.3g}"), "detections": kept}
 
 
 Cells = dict[str, list[Cell]]
@@ -60,14 +61,14 @@ def band(range_m: Array) -> np.ndarray:
     return np.asarray(np.searchsorted(EDGES_M, range_m, side="right") - 1)
 
 
-def add(cells: Cells, found: Detections, lit: Array, strays: Array, hot: Array, dock_m: float) -> None:
+def add(cells: Cells, found: Detections, lit: Array, spurious: Array, hot: Array, dock_m: float) -> None:
     """Count one frame.
 
     `lit` (M, 5) are the lights' pixels, range m, whether rear and SNR; `strays` (S, 2) px are other lamps, and `hot`
     (H, 2) px bad pixels.
     """
     shows = np.where(lit[:, 4:] > _LEAST_SNR, lit[:, :2], np.inf)
-    owner = matches(found, np.concatenate([shows, strays]), _NEAR_PX)
+    owner = matches(found, np.concatenate([shows, spurious]), _NEAR_PX)
     for i in np.flatnonzero((owner >= 0) & (owner < len(lit))):
         at_light, at_hot = (np.linalg.norm(uv - found.uv[i], axis=1) for uv in (lit[owner[i], None, :2], hot))
         if at_light[0] > _NEAR_PX or at_hot.min(initial=np.inf) < _ON_PX < at_light[0]:
@@ -80,12 +81,12 @@ def add(cells: Cells, found: Detections, lit: Array, strays: Array, hot: Array, 
         cov, says = found.cov_px2[i], [float(found.p_light[i]), float(found.p_rear[i])]
         sigma_px = float(np.sqrt(0.5 * np.trace(cov)))
         if k < 0:
-            cells["false"][band(np.array(dock_m))].spots.append([sigma_px, 0.0, *says])
+            cells["false"][band(np.array(dock_m))].detections.append([sigma_px, 0.0, *says])
         elif k < len(lit):
             e = found.uv[i] - lit[k, :2]
             over = float(np.sqrt(e @ np.linalg.solve(cov, e)))
             along_px = float(np.linalg.norm(e)) / over if over > 0.0 else sigma_px  # of a covariance that is no circle
-            cells["rear" if lit[k, 3] else "front"][band(lit[k, 2])].spots.append([along_px, over, *says])
+            cells["rear" if lit[k, 3] else "front"][band(lit[k, 2])].detections.append([along_px, over, *says])
 
 
 def measure(scenario: Scenario) -> Cells:
@@ -94,7 +95,7 @@ def measure(scenario: Scenario) -> Cells:
     rear = station.layer != station.layers.index(station.layers_front_to_rear()[0])
     cells: Cells = {kind: [Cell() for _ in EDGES_M] for kind in KINDS}
     scan: detect.Scan | None = None
-    plan = exposed(plan_of(scenario, station, camera, SEED))
+    plan = exposed(schedule_of(scenario, station, camera, SEED))
     hot = plan.studio(0).hot_at[::-1].T
     for dock_m, frame, shot, dark in _frames(plan):
         scan = scan or detect.Scan(frame, config.detect)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bench.shipped import CAMERA_FILE, STATION_FILE
-from lumidock.metrics import read_rows, true_poses
+from lumidock.evaluation.metrics import read_rows, true_poses
 from lumidock.reproduce import work
 from lumidock.reproduce.jobs import Job, run_jobs
 from lumidock.sim.scenario import load_scenario, shipped_scenarios

@@ -13,15 +13,15 @@ from lumidock import match
 from lumidock.config import Config
 from lumidock.datatypes import Detections
 from lumidock.localizer import Localizer
+from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import load_scenario
-from lumidock.sim.spots import spot_frames
 
 _FRAMES, _SEED = 300, 300
 _COLD = {
     "one layer, 6 lights": ("missing-1", ()),
     "one layer, 1-3 missing + 1-5 spurious": ("missing-spurious", ()),
     "one layer, 7 lights + 20 spurious": ("missing-spurious", ("faults.missing=0", "faults.spurious=20")),
-    "both layers, 13 lights": ("joint", ("spots.drop=0", "faults.spurious=0", "spots.wrong_layer=0")),
+    "both layers, 13 lights": ("joint", ("detections.drop=0", "faults.spurious=0", "detections.wrong_layer=0")),
     "both layers, 20 % missing, 3 spurious, 30 % wrong labels": ("joint", ()),
 }
 
@@ -31,9 +31,9 @@ def cold_ms(scenario: str, settings: tuple[str, ...]) -> np.ndarray:
     station, camera, config = shipped_station(), shipped_camera(), Config()
     plan, expected = match.plan(station, camera, config.match), match.prior(None, config.prior)
     times = []
-    for frame in islice(spot_frames(load_scenario(scenario, settings), station, camera, _SEED), _FRAMES):
+    for frame in islice(simulated_frames(load_scenario(scenario, settings), station, camera, _SEED), _FRAMES):
         start = time.perf_counter()
-        found = match.spots(frame.detections, plan, config.match)
+        found = match.detections(frame.detections, plan, config.match)
         match.acquire(found, plan, camera, expected, config.match)
         times.append(1e3 * (time.perf_counter() - start))
     return np.array(times[1:])
@@ -43,7 +43,8 @@ def warm_ms() -> np.ndarray:
     """Milliseconds (N,) of each frame of a nominal run through the light door, the cold ones left out."""
     localizer = Localizer(shipped_station(), shipped_camera())
     frames: list[Detections] = [
-        frame.detections for frame in spot_frames(load_scenario("nominal"), localizer.station, localizer.camera, _SEED)
+        frame.detections
+        for frame in simulated_frames(load_scenario("nominal"), localizer.station, localizer.camera, _SEED)
     ]
     times = []
     for detections in frames:

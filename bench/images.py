@@ -9,18 +9,18 @@ from typing import Any, Literal
 import numpy as np
 
 from bench.shipped import CAMERA_FILE, STATION_FILE, shipped_camera, shipped_station
+from lumidock.app.run import Setup, run
 from lumidock.config import Config, ExtractConfig
 from lumidock.datatypes import Frame
-from lumidock.metrics import evaluate, read_rows
+from lumidock.evaluation.metrics import evaluate, read_rows
 from lumidock.paper import PaperLocalizer, extract
-from lumidock.run import Setup, run
 from lumidock.sim.scenario import load_scenario, trajectory
 from lumidock.sim.sequence import render_frame, write_rendered
-from lumidock.streams.runfolder import RunFolder
+from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.sources import open_source
 
 SEEDS = (101, 102, 103)
-_SAME_SPOT_PX = 3.0
+_SAME_DETECTION_PX = 3.0
 
 
 def simulate_and_run(scenario: str, seed: int, folder: Path) -> tuple[Path, Path]:
@@ -40,11 +40,11 @@ def search_labels(sequence: Path, out: Path) -> tuple[int, int]:
     true: dict[str, dict[str, np.ndarray]] = {}
     for row in read_rows(sequence / "lights_truth.csv", ("frame", "light", "u_px", "v_px")):
         true.setdefault(row["frame"], {})[row["light"]] = np.array([float(row["u_px"]), float(row["v_px"])])
-    spots: dict[str, list[dict[str, str]]] = {}
+    detections: dict[str, list[dict[str, str]]] = {}
     for row in read_rows(out / "lights.csv", ("frame", "light", "u_px", "v_px", "p_rear")):
-        spots.setdefault(row["frame"], []).append(row)
+        detections.setdefault(row["frame"], []).append(row)
     eligible = right = 0
-    for frame, rows in spots.items():
+    for frame, rows in detections.items():
         front = [(_maker(row, true[frame]), row["light"]) for row in rows if float(row["p_rear"]) <= 0.5]
         if len(front) >= 4 and all(maker.startswith("F") for maker, _ in front):
             eligible += 1
@@ -52,11 +52,11 @@ def search_labels(sequence: Path, out: Path) -> tuple[int, int]:
     return eligible, right
 
 
-def _maker(spot: dict[str, str], lights: dict[str, np.ndarray]) -> str:
+def _maker(detection: dict[str, str], lights: dict[str, np.ndarray]) -> str:
     """The light that made a spot, or nothing."""
-    at = np.array([float(spot["u_px"]), float(spot["v_px"])])
+    at = np.array([float(detection["u_px"]), float(detection["v_px"])])
     light = min(lights, key=lambda name: float(np.hypot(*(lights[name] - at))), default="")
-    return light if light and np.hypot(*(lights[light] - at)) < _SAME_SPOT_PX else ""
+    return light if light and np.hypot(*(lights[light] - at)) < _SAME_DETECTION_PX else ""
 
 
 def rear_reach_m(gray: Literal["max", "luma"], seed: int) -> float:
@@ -68,9 +68,9 @@ def rear_reach_m(gray: Literal["max", "luma"], seed: int) -> float:
         rng = np.random.default_rng([seed, number])
         nothing = np.empty(0, np.int64)
         image, seen, _ = render_frame(scenario, station, camera, poses[number], np.empty((0, 2)), nothing, rng)
-        spots = extract.lights(Frame("", 0, image), ExtractConfig(gray=gray)).uv
-        distance = np.linalg.norm(spots[:, None] - seen.uv[rear][None], axis=2).min(axis=0, initial=np.inf)
-        if (distance >= _SAME_SPOT_PX).any():
+        detections = extract.lights(Frame("", 0, image), ExtractConfig(gray=gray)).uv
+        distance = np.linalg.norm(detections[:, None] - seen.uv[rear][None], axis=2).min(axis=0, initial=np.inf)
+        if (distance >= _SAME_DETECTION_PX).any():
             break
         reach = float(poses[number, 2, 3])
     return reach

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from bench.shipped import shipped_camera, shipped_station
-from lumidock.sim.plan import plan_of
 from lumidock.sim.scattering import halo
 from lumidock.sim.scenario import load_scenario
+from lumidock.sim.schedule import schedule_of
 
 SCENARIOS = ("approach", "headlamp", "pool", "occluder", "flat-port")
 FRAMES = (40, 140, 190, 215)  # of the approach: z = 24, 9, 1.5, -2.25 m
@@ -33,7 +33,7 @@ def _best_s(step: Callable[[], object]) -> float:
 
 def costs_ms(name: str, folder: Path) -> list[float]:
     """Slowest of the frames: all, light, sensor, encoding; ms."""
-    plan = plan_of(load_scenario(name), shipped_station(), shipped_camera(), 0)
+    plan = schedule_of(load_scenario(name), shipped_station(), shipped_camera(), 0)
     rows = []
     for number in FRAMES:
         studio, moment = plan.studio(number), plan.moment(number)

@@ -132,8 +132,10 @@ def matching_growth(lights: tuple[int, ...], spurious: tuple[int, ...]) -> dict[
             times: Times = defaultdict(list)
             for turn in range(_DRAWS + 1):
                 shown = (uv + rng.normal(0.0, 0.3, (m, 2)))[rng.random(m) < 0.9]
-                strays = rng.uniform((0.0, 0.0), (camera.width, camera.height), (count, 2))
-                found = match.spots(Detections.from_uv("0", 0, np.concatenate([shown, strays])), plan, config.match)
+                spurious = rng.uniform((0.0, 0.0), (camera.width, camera.height), (count, 2))
+                found = match.detections(
+                    Detections.from_uv("0", 0, np.concatenate([shown, spurious])), plan, config.match
+                )
                 timed(
                     times if turn else defaultdict(list),
                     "match",

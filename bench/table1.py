@@ -13,8 +13,8 @@ from multiprocessing import get_context
 
 from bench.shipped import shipped_camera, shipped_station
 from lumidock.reproduce import trials
-from lumidock.reproduce.paper import TABLE_1
-from lumidock.reproduce.plan import ROWS
+from lumidock.reproduce.experiments import ROWS
+from lumidock.reproduce.paper_figures import TABLE_1
 from lumidock.reproduce.trials import Counts
 
 TRIALS = 30

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from bench.shipped import shipped_camera, shipped_station
-from lumidock.sim.plan import plan_of
 from lumidock.sim.scenario import R_DOCK_CAM_HEAD_ON, load_scenario
+from lumidock.sim.schedule import schedule_of
 
 WATERS = ("IB", "II", "III", "1C", "3C", "5C", "7C", "pool-clear", "pool-murky")
 EXPOSURES_MS = (0.5, 2.0, 6.0)
@@ -19,7 +19,7 @@ def snr(settings: tuple[str, ...], layer: str, range_m: float) -> float:
     """Median matched-filter SNR of a layer's lights, seen head-on with the layer's middle at `range_m`."""
     station = shipped_station()
     lights = station.lights_of(layer)
-    plan = plan_of(load_scenario("approach", settings), station, shipped_camera(), 0)
+    plan = schedule_of(load_scenario("approach", settings), station, shipped_camera(), 0)
     T_dock_cam = np.eye(4)
     T_dock_cam[:3, :3], T_dock_cam[2, 3] = R_DOCK_CAM_HEAD_ON, range_m + float(station.p_dock[lights, 2].mean())
     moment = replace(plan.moment(0), T_dock_cam=T_dock_cam, T_cam_later=np.eye(4))

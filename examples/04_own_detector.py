@@ -12,7 +12,7 @@ import numpy as np
 from lumidock import Detections, Localizer, load_camera, load_station
 
 
-def spots(image: np.ndarray) -> np.ndarray:
+def detections(image: np.ndarray) -> np.ndarray:
     """Centres (N, 2) px of what is brighter than half the brightest."""
     gray = cv2.GaussianBlur(image.max(axis=2), (0, 0), 2.0)
     _, mask = cv2.threshold(gray, 0.5 * float(gray.max()), 255, cv2.THRESH_BINARY)
@@ -23,5 +23,5 @@ if len(sys.argv) != 4:
     sys.exit(__doc__)
 picture, station, camera = map(Path, sys.argv[1:4])
 localizer = Localizer(load_station(station), load_camera(camera))
-fix = localizer.process_detections(Detections.from_uv(picture.stem, 0, spots(cv2.imread(str(picture)))))
+fix = localizer.process_detections(Detections.from_uv(picture.stem, 0, detections(cv2.imread(str(picture)))))
 print(f"{fix.n_seen} spots, {fix.n_used} of them lights of the dock: {fix.reason or 'valid'}")

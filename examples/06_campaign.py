@@ -6,8 +6,8 @@ python examples/06_campaign.py FOLDER
 import sys
 from pathlib import Path
 
-from lumidock.campaign import plan, prepare, run_campaign, tabulate
-from lumidock.campaign_table import markdown
+from lumidock.evaluation.campaign import plan, prepare, run_campaign, tabulate
+from lumidock.evaluation.campaign_table import markdown
 from lumidock.sim.scenario import load_scenario
 
 HERE = Path(__file__).parents[1]

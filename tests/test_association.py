@@ -11,8 +11,8 @@ from scipy.stats import multivariate_normal
 from tracks import BOTH, CAMERA, CONFIG, PLAN, PRIOR, STATION, STEP_NS, M, begun, frames_of, head_on, spots_at
 
 from lumidock import match, track
-from lumidock._kernels import association
-from lumidock._kernels import track as kernel
+from lumidock._kernels.tracking import association
+from lumidock._kernels.tracking import track as kernel
 from lumidock.geometry import se3_inverse
 from lumidock.localizer import Localizer
 

@@ -56,16 +56,16 @@ def test_prediction_covariance_agrees_with_sampling(rng):
 
 @pytest.mark.parametrize("z", [4.0, 9.0, 18.0])
 @pytest.mark.parametrize(("missing", "strays"), [(0, 0), (3, 0), (2, 3), (3, 5), (4, 0)])
-def test_history_names_the_lights_that_are_left(rng, z, missing, strays):
+def test_history_names_the_lights_that_are_left(rng, z, missing, spurious):
     for _ in range(4):
         T_dock_cam, predicted = moving(rng, z + 1.65)
-        true = np.concatenate([rng.permutation(7)[missing:], np.full(strays, -1)])
+        true = np.concatenate([rng.permutation(7)[missing:], np.full(spurious, -1)])
         uv = project_lights(CAMERA, T_dock_cam, P_DOCK)[true]
-        away = rng.uniform(0, 2 * np.pi, strays)
-        stray_uv = uv[0] + rng.uniform(60, 400, strays)[:, None] * np.stack([np.cos(away), np.sin(away)], 1)
+        away = rng.uniform(0, 2 * np.pi, spurious)
+        stray_uv = uv[0] + rng.uniform(60, 400, spurious)[:, None] * np.stack([np.cos(away), np.sin(away)], 1)
         uv[true < 0] = stray_uv
         nearest = np.linalg.norm(stray_uv[:, None] - project_lights(CAMERA, T_dock_cam, P_DOCK)[None], axis=2)
-        if strays and nearest.min() < 20:
+        if spurious and nearest.min() < 20:
             continue  # a stray on top of a light is not what is asked here
         track, light = btekf.correct(predicted, CAMERA, P_DOCK, uv + rng.normal(0, 0.3, uv.shape), CONFIG)
         assert light.tolist() == true.tolist()

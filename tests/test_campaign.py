@@ -12,9 +12,9 @@ import pytest
 from bench.shipped import CAMERA_FILE, STATION_FILE
 from commandline import LUMIDOCK, wait_for
 
-from lumidock import campaign as module
-from lumidock.campaign import plan, prepare, run_campaign, tabulate
 from lumidock.errors import InputError, LumidockError
+from lumidock.evaluation import campaign as module
+from lumidock.evaluation.campaign import plan, prepare, run_campaign, tabulate
 from lumidock.sim.scenario import load_scenario
 
 SMALL = ("missing-1", ("path.count=8",))

@@ -8,7 +8,7 @@ import pytest
 from bench.shipped import shipped_camera, shipped_station
 
 from lumidock import detect, layers
-from lumidock._kernels.detect import see
+from lumidock._kernels.detection.detect import see
 from lumidock.config import DetectConfig, LabelConfig
 from lumidock.datatypes import MOSAICS, Attitude, Frame
 from lumidock.sim.scenario import load_scenario, trajectory
@@ -228,14 +228,14 @@ def test_the_cap_keeps_the_strongest(rng):
     for k in range(64):
         add_spot(image, 30.0 + 48.0 * (k % 8), 30.0 + 48.0 * (k // 8), peak=60.0 + 2.0 * k)
     assert len(found(image)) == 64
-    kept = found(image, DetectConfig(max_spots=10))
+    kept = found(image, DetectConfig(max_detections=10))
     assert len(kept) == 10
     assert kept.uv[:, 1].min() > 250.0
 
 
 def test_a_frame_full_of_points_ends_at_the_cap(rng):
     image = to_picture(255.0 * (rng.random((1024, 1224)) < 0.002))
-    assert len(found(image)) <= CONFIG.max_spots
+    assert len(found(image)) <= CONFIG.max_detections
 
 
 def test_the_same_frame_gives_the_same_bytes(rendered):
@@ -493,7 +493,7 @@ def test_no_frame_takes_long(blobs, rng):
             spots = detect.lights(frame, CONFIG, scan)
             runs.append(time.thread_time() - start)
         times[name] = np.median(runs)
-        assert len(spots) <= CONFIG.max_spots
+        assert len(spots) <= CONFIG.max_detections
     assert times["crowded"] < 20.0 * times["easy"]
 
 

@@ -9,12 +9,12 @@ import cv2
 import pytest
 from bench.shipped import CAMERA_FILE, STATION_FILE, shipped_camera, shipped_station
 
+from lumidock.app.run import Setup, run
 from lumidock.config import Config
 from lumidock.localizer import Localizer
-from lumidock.run import Setup, run
 from lumidock.sim.scenario import load_scenario
 from lumidock.sim.sequence import write_rendered
-from lumidock.streams.runfolder import RunFolder
+from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.sources import open_source
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

@@ -62,18 +62,18 @@ def test_a_bar_and_a_rim_are_no_lights_and_a_disc_is_one():
     cv2.rectangle(image, (40, 40), (240, 52), 250, -1)
     cv2.ellipse(image, (350, 120), (60, 60), 0, 20, 220, 250, 4)
     cv2.circle(image, (120, 300), 14, 250, -1, cv2.LINE_AA)
-    spots = spots_of(image)
-    assert len(spots) == 1
-    np.testing.assert_allclose(spots.uv[0], [120, 300], atol=0.2)
-    assert spots.radius_px[0] == pytest.approx(14, abs=1)
+    detections = spots_of(image)
+    assert len(detections) == 1
+    np.testing.assert_allclose(detections.uv[0], [120, 300], atol=0.2)
+    assert detections.radius_px[0] == pytest.approx(14, abs=1)
 
 
 def test_touching_halos_are_cut_apart():
     image = canvas()
     for u in (200, 239):
         cv2.circle(image, (u, 200), 20, 250, -1, cv2.LINE_AA)
-    spots = spots_of(image)
-    np.testing.assert_allclose(np.sort(spots.uv[:, 0]), [200, 239], atol=1.5)
+    detections = spots_of(image)
+    np.testing.assert_allclose(np.sort(detections.uv[:, 0]), [200, 239], atol=1.5)
 
 
 def test_a_light_cut_by_the_edge_keeps_its_centre():

@@ -7,10 +7,11 @@ import pytest
 from conftest import assert_close
 from scipy.stats import chi
 
-from lumidock import integrity, match, track, trust
+from lumidock import integrity, match, track
 from lumidock.camera import load_camera
 from lumidock.config import Config, IntegrityConfig
 from lumidock.datatypes import Guide, Protection
+from lumidock.evaluation import claims
 from lumidock.geometry import bearing_and_range, se3_exp, se3_inverse
 from lumidock.integrity import Bounds, alert_limit, alert_limits, bounds, guide_holds, pose_holds, sigma_factors
 from lumidock.station import load_station
@@ -57,7 +58,7 @@ def covariance(rng, sigma=(0.01, 0.01, 0.03, 0.002, 0.002, 0.001)):
 
 def sizes(T_dock_cam, truth):
     """Lateral m, axial m, angle rad, bearing rad and range m of an error (5,)."""
-    e = trust.pose_error(T_dock_cam, truth)
+    e = claims.pose_error(T_dock_cam, truth)
     b = np.array(bearing_and_range(T_dock_cam)) - np.array(bearing_and_range(truth))
     return [math.hypot(e[0], e[1]), abs(e[2]), np.linalg.norm(e[3:]), math.hypot(b[0], b[1]), abs(b[2])]
 
@@ -106,10 +107,10 @@ def test_levels_hold_as_often_as_they_say(z_m, rng):
     assert (over <= risk + slack).all(), over
     assert abs(over[[1, 4]] - risk).max() < slack  # in one dimension the level is exact
     assert (over > 0.0).any()
-    errors = np.array([trust.pose_error(T_dock_cam, truth) for truth in truths])
+    errors = np.array([claims.pose_error(T_dock_cam, truth) for truth in truths])
     scale = np.sqrt(np.diagonal(bound.covariance))
     assert_close(np.cov(errors.T) / np.outer(scale, scale), bound.covariance / np.outer(scale, scale), atol=0.12)
-    assert abs(trust.nees(errors, np.repeat(bound.covariance[None], n, axis=0)).mean() - 6.0) < 0.3
+    assert abs(claims.nees(errors, np.repeat(bound.covariance[None], n, axis=0)).mean() - 6.0) < 0.3
 
 
 @pytest.mark.parametrize("place", [[0.0, 0.5, 0.08], [0.4, 0.01, 0.09], [0.02, 0.01, 0.0], [0.3, 0.02, -0.08]])
@@ -151,7 +152,7 @@ def test_levels_hold_every_other_belief_that_is_not_out_of_the_question(rng):
         far = replace(near, log_weight=-15.0)  # e^-15 < 1e-6
         wide = levels_of(bounds([a, near], config))
         assert (wide[:2] >= np.array(sizes(T_a, T_b))[:2]).all()
-        assert wide[2] >= np.linalg.norm(trust.pose_error(T_a, T_b)[3:])
+        assert wide[2] >= np.linalg.norm(claims.pose_error(T_a, T_b)[3:])
         assert (wide >= levels_of(bounds([near], config))).all()
         assert_close(levels_of(bounds([a, far], config)), levels_of(bounds([a], config)))
 

@@ -6,7 +6,7 @@ from conftest import assert_close
 from numpy.testing import assert_array_equal
 from scipy.optimize import linear_sum_assignment
 
-from lumidock._kernels.swarm import assign, registration_cost, swarm
+from lumidock.paper.swarm import assign, registration_cost, swarm
 
 LIGHTS = np.array([[-1, 0.55], [1, 0.5], [0.9, -0.6], [-0.8, -0.5], [0.1, 0.9], [0.3, -0.2]])
 NEW = np.full_like(LIGHTS, np.nan)  # no previous frame

@@ -18,8 +18,8 @@ from zenoh.ext import Int64, z_deserialize
 
 from lumidock.datatypes import Fix, Frame
 from lumidock.streams import ros2
+from lumidock.streams.vehicle import Vehicle
 from lumidock.streams.zenohlink import ZenohLink, dds_name
-from lumidock.vehicle import Vehicle
 
 T = np.diag([1.0, -1, -1, 1])
 T[:3, 3] = [0.25, -0.5, 6.0]

@@ -7,16 +7,16 @@ import pytest
 from numpy.testing import assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from lumidock import trust
 from lumidock.camera import load_camera
 from lumidock.config import Config
 from lumidock.datatypes import Attitude, Detections, Frame
 from lumidock.errors import FrameError, InputError
+from lumidock.evaluation import claims
 from lumidock.integrity import alert_limit
 from lumidock.localizer import Localizer
 from lumidock.pose import project_lights
+from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import load_scenario
-from lumidock.sim.spots import spot_frames
 from lumidock.station import Station, load_station
 
 ROOT = Path(__file__).parents[1]
@@ -27,7 +27,7 @@ STEP_NS = 66_666_700
 
 
 def frames_of(scenario, *settings, seed=0):
-    return list(spot_frames(load_scenario(scenario, settings), STATION, CAMERA, seed))
+    return list(simulated_frames(load_scenario(scenario, settings), STATION, CAMERA, seed))
 
 
 def run(frames, localizer=None):
@@ -71,13 +71,13 @@ def require_sound(fix):
 def require_true(fix, T_dock_cam):
     """Errors of a valid pose and a guide are within their protection levels."""
     if fix.valid:
-        e, p = trust.pose_error(fix.T_dock_cam, T_dock_cam), fix.protection
+        e, p = claims.pose_error(fix.T_dock_cam, T_dock_cam), fix.protection
         assert np.hypot(e[0], e[1]) < p.lateral_m
         assert abs(e[2]) < p.axial_m
         assert np.linalg.norm(e[3:]) < p.angle_rad
     if fix.guide:
         g = fix.guide
-        off = np.array([g.bearing_x_rad, g.bearing_y_rad, g.range_m]) - trust.true_guide(T_dock_cam)
+        off = np.array([g.bearing_x_rad, g.bearing_y_rad, g.range_m]) - claims.true_guide(T_dock_cam)
         turned = (off[:2] + np.pi) % (2.0 * np.pi) - np.pi  # past the dock's origin a bearing is about half a turn
         assert np.hypot(*turned) < g.pl_bearing_rad
         assert abs(off[2]) < g.pl_range_m
@@ -104,9 +104,9 @@ def test_an_approach_goes_through_its_stages_in_order():
 def test_the_covariance_of_valid_poses_is_honest():
     frames, fixes = approach()
     both = [(f, x) for f, x in zip(frames, fixes, strict=True) if x.valid]
-    errors = np.array([trust.pose_error(x.T_dock_cam, f.T_dock_cam) for f, x in both])
+    errors = np.array([claims.pose_error(x.T_dock_cam, f.T_dock_cam) for f, x in both])
     # a filter that allows for survey errors which this run does not have is too careful, never too bold
-    assert 0.0 < trust.nees(errors, np.array([x.covariance for _, x in both])).mean() < 7.0
+    assert 0.0 < claims.nees(errors, np.array([x.covariance for _, x in both])).mean() < 7.0
 
 
 EXACT = replace(STATION, sigma_light_m=0.0, sigma_layer_m=0.0, sigma_focal=0.0, sigma_center_px=0.0)
@@ -132,12 +132,12 @@ def cramer_rao(T_dock_cam, lights, sigma_px=0.5):
 @pytest.mark.parametrize(("z_m", "layers"), [(8.0, "joint"), (14.0, "joint"), (5.0, "missing-1")])
 def test_cold_poses_are_as_good_as_the_light_allows(z_m, layers):
     settings = ["path.count=120", f"path.z_m=[{z_m}, {z_m + 0.001}]", "faults.spurious=0", "faults.missing=0"]
-    frames = frames_of(layers, *settings, "spots.drop=0", "spots.wrong_layer=0", seed=11)
+    frames = frames_of(layers, *settings, "detections.drop=0", "detections.wrong_layer=0", seed=11)
     localizer, squares, laterals = Localizer(EXACT, CAMERA, cold=True), [], []
     for frame in frames:
         localizer.process_detections(frame.detections)
         T_cam_dock = localizer.beliefs[0].T_cam_dock
-        e = trust.pose_error(np.linalg.inv(T_cam_dock), frame.T_dock_cam)
+        e = claims.pose_error(np.linalg.inv(T_cam_dock), frame.T_dock_cam)
         bound = cramer_rao(frame.T_dock_cam, frame.light[frame.light >= 0])
         squares.append(e @ np.linalg.solve(bound, e))
         laterals.append(np.hypot(e[0], e[1]))
@@ -190,7 +190,7 @@ def test_layers_that_come_and_go_make_no_jump():
         seen = replace(d, **{key: getattr(d, key)[keep] for key in ("uv", "radius_px", "flux", "p_light", "p_rear")})
         fix = localizer.process_detections(seen)
         if fix.valid:
-            e, sigma = trust.pose_error(fix.T_dock_cam, frame.T_dock_cam), np.sqrt(np.diagonal(fix.covariance))
+            e, sigma = claims.pose_error(fix.T_dock_cam, frame.T_dock_cam), np.sqrt(np.diagonal(fix.covariance))
             if before is not None and before[0] != hidden:
                 moves.append(np.abs(e - before[1]) / np.hypot(sigma, before[2]))
             before = hidden, e, sigma
@@ -209,8 +209,8 @@ def test_innovations_are_as_large_as_they_should_be():
 
 def test_one_layer_alone_is_enough_near_the_dock():
     """Survey errors there are larger in the picture than noise: leaving one of seven lights out says something."""
-    settings = ("path.start_z_m=9", "path.end_z_m=3", "path.frame_interval_s=0.0666667", "spots.rear_range_m=0.01")
-    frames = frames_of("approach", *settings, "spots.survey=true", "spots.calibration=true", seed=4)
+    settings = ("path.start_z_m=9", "path.end_z_m=3", "path.frame_interval_s=0.0666667", "detections.rear_range_m=0.01")
+    frames = frames_of("approach", *settings, "detections.survey=true", "detections.calibration=true", seed=4)
     fixes = run(frames)
     for frame, fix in zip(frames, fixes, strict=True):
         require_sound(fix)
@@ -247,7 +247,7 @@ def test_forget_is_a_new_localizer():
 
 def test_a_black_out_ends_trust_in_time_and_is_over_at_once():
     settings = ("path.start_z_m=14", "path.end_z_m=10", "path.frame_interval_s=0.0666667")
-    frames = frames_of("approach", *settings, "spots.black_outs.at_s=[[2.0, 3.0]]", seed=1)
+    frames = frames_of("approach", *settings, "detections.black_outs.at_s=[[2.0, 3.0]]", seed=1)
     fixes = run(frames)
     t = np.array([frame.detections.t_ns for frame in frames]) * 1e-9
     dark = np.array([len(frame.detections) == 0 for frame in frames])
@@ -269,7 +269,7 @@ def test_a_black_out_ends_trust_in_time_and_is_over_at_once():
 
 def test_after_a_long_black_out_the_search_begins_anew():
     settings = ("path.start_z_m=14", "path.end_z_m=9", "path.frame_interval_s=0.0666667")
-    frames = frames_of("approach", *settings, "spots.black_outs.at_s=[[1.0, 4.0]]", seed=2)
+    frames = frames_of("approach", *settings, "detections.black_outs.at_s=[[1.0, 4.0]]", seed=2)
     fixes = run(frames)
     after = 1 + max(k for k, frame in enumerate(frames) if not len(frame.detections))
     assert fixes[after - 1].status == "none"

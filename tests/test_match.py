@@ -11,8 +11,8 @@ from lumidock import match, verify
 from lumidock.datatypes import Attitude, Detections
 from lumidock.geometry import se3_inverse
 from lumidock.pose import project_lights
+from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import load_scenario
-from lumidock.sim.spots import spot_frames
 
 HEAD_ON = np.diag([1.0, -1.0, -1.0])
 
@@ -40,7 +40,7 @@ def wrong(name, light):
 
 
 def frames(scenario, *settings, seed=0):
-    return list(spot_frames(load_scenario(scenario, settings), STATION, CAMERA, seed))
+    return list(simulated_frames(load_scenario(scenario, settings), STATION, CAMERA, seed))
 
 
 def shuffled(detections, order):
@@ -117,9 +117,11 @@ def test_the_mirror_image_of_the_dock_is_no_dock():
 
 @pytest.mark.parametrize("label", ["wrong", "absent"])
 def test_both_layers_are_named_without_their_colours(label):
-    settings = ["spots.wrong_layer=1.0"] if label == "wrong" else ["spots.wrong_layer=0.0", "spots.color=false"]
+    settings = (
+        ["detections.wrong_layer=1.0"] if label == "wrong" else ["detections.wrong_layer=0.0", "detections.color=false"]
+    )
     accepted = 0
-    for frame in frames("joint", "path.count=30", "spots.drop=0.0", *settings, seed=3):
+    for frame in frames("joint", "path.count=30", "detections.drop=0.0", *settings, seed=3):
         found = acquire(frame.detections)
         if answer(found):
             accepted += 1
@@ -129,12 +131,12 @@ def test_both_layers_are_named_without_their_colours(label):
 
 def test_a_right_colour_is_evidence_and_a_wrong_one_is_against():
     def best(*settings):
-        seen = frames("joint", "path.count=10", "spots.drop=0.0", *settings, seed=4)
+        seen = frames("joint", "path.count=10", "detections.drop=0.0", *settings, seed=4)
         return np.array([acquire(frame.detections).candidates[0].log_evidence for frame in seen])
 
-    right = best("spots.wrong_layer=0.0")
-    assert (right > best("spots.wrong_layer=0.0", "spots.color=false")).all()
-    assert (right > best("spots.wrong_layer=1.0") + 3.0).all()
+    right = best("detections.wrong_layer=0.0")
+    assert (right > best("detections.wrong_layer=0.0", "detections.color=false")).all()
+    assert (right > best("detections.wrong_layer=1.0") + 3.0).all()
 
 
 @pytest.mark.parametrize("roll_deg", [-150, 75, 180])

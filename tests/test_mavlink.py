@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from lumidock.datatypes import Fix, Frame
 from lumidock.geometry import se3_exp, se3_inverse
 from lumidock.streams.mavlink import R_LOCAL_DOCK, Mavlink, covariance_of_body, estimate, roll_pitch_yaw
-from lumidock.vehicle import Vehicle
+from lumidock.streams.vehicle import Vehicle
 
 IMAGE = np.zeros((8, 8), np.uint8)
 

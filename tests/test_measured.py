@@ -7,9 +7,9 @@ from bench.shipped import shipped_camera, shipped_station
 
 from lumidock.datatypes import Detections
 from lumidock.errors import InputError
+from lumidock.sim.detections import simulated_frames
 from lumidock.sim.measured import KINDS, detector_errors, measured_like, measured_table
 from lumidock.sim.scenario import load_scenario, shipped_scenarios
-from lumidock.sim.spots import spot_frames
 
 STATION, CAMERA = shipped_station(), shipped_camera()
 REAR = STATION.layer != STATION.layers.index(STATION.layers_front_to_rear()[0])
@@ -17,8 +17,8 @@ PATHS = [name for name in shipped_scenarios() if load_scenario(name).path.kind !
 
 
 def frames_of(name, like, *settings, seed=5):
-    scenario = load_scenario(name, (f"spots.detector={like}", *settings))
-    return list(spot_frames(scenario, STATION, CAMERA, seed))
+    scenario = load_scenario(name, (f"detections.detector={like}", *settings))
+    return list(simulated_frames(scenario, STATION, CAMERA, seed))
 
 
 @pytest.mark.parametrize("name", PATHS)
@@ -26,8 +26,8 @@ def test_the_detector_was_measured_on_the_pictures_of_every_shipped_docking(name
     errors = detector_errors(measured_like(load_scenario(name)))
     for kind in KINDS:
         for cell in errors.cells[kind]:
-            assert np.isfinite(cell.spots[:, :3]).all()
-            assert cell.rate == 0.0 or len(cell.spots)
+            assert np.isfinite(cell.detections[:, :3]).all()
+            assert cell.rate == 0.0 or len(cell.detections)
             assert kind == "false" or cell.rate <= 1.0
 
 
@@ -60,7 +60,12 @@ def test_lights_are_found_and_false_spots_seen_as_often_as_measured(like):
 
 def test_spots_err_as_measured_over_their_own_covariance():
     rows = measured_table()["scenarios"]["pool"]
-    wanted = {(spot[0], spot[1]) for kind in ("front", "rear") for cell in rows[kind] for spot in cell["spots"]}
+    wanted = {
+        (detection[0], detection[1])
+        for kind in ("front", "rear")
+        for cell in rows[kind]
+        for detection in cell["detections"]
+    }
     got = []
     for frame in frames_of("approach", "pool"):
         d, lights = frame.detections, np.flatnonzero(frame.light >= 0)
@@ -73,12 +78,12 @@ def test_spots_err_as_measured_over_their_own_covariance():
 
 
 def test_faults_of_the_scenario_stay_beside_the_detectors():
-    settings = ("faults.spurious=2", "spots.noise_px=0.25")
+    settings = ("faults.spurious=2", "detections.noise_px=0.25")
     for frame in frames_of("approach", "approach", *settings):
         d = frame.detections
-        strays = np.isclose(d.cov_px2[:, 0, 0], 0.0625) & (frame.light < 0) & (d.p_light == 1.0)
-        assert strays.sum() == 2
-    blind = frames_of("approach", "pool", "spots.black_outs.at_s=[[3.0, 4.0]]")
+        spurious = np.isclose(d.cov_px2[:, 0, 0], 0.0625) & (frame.light < 0) & (d.p_light == 1.0)
+        assert spurious.sum() == 2
+    blind = frames_of("approach", "pool", "detections.black_outs.at_s=[[3.0, 4.0]]")
     assert [len(f.detections) for f in blind if 3_000_000_000 <= f.detections.t_ns <= 4_000_000_000] == [0] * 7
     dead = frames_of("approach", "water-ib", "lamps.failures={F1: 0.0}")
     assert not any(STATION.ids.index("F1") in frame.light for frame in dead)
@@ -103,15 +108,15 @@ def test_a_frame_is_counted_by_what_became_of_each_light():
     bench.add(cells, found, lit, stray, hot, 7.0)
     front, rear, false = cells["front"][1], cells["rear"][2], cells["false"][1]
     assert (front.of, rear.of, false.of) == (2, 2, 1)
-    np.testing.assert_allclose(front.spots, [[0.5, 10.0, 0.9, 0.1]])
-    np.testing.assert_allclose(rear.spots, [[1.0, 0.5, 0.8, 0.2]])
-    np.testing.assert_allclose(false.spots, [[0.5, 0.0, 0.1, np.nan], [0.5, 0.0, 0.2, 0.3]])
-    assert false.as_dict(20)["spots"] == [[0.5, 0.0, 0.1, None], [0.5, 0.0, 0.2, 0.3]]
+    np.testing.assert_allclose(front.detections, [[0.5, 10.0, 0.9, 0.1]])
+    np.testing.assert_allclose(rear.detections, [[1.0, 0.5, 0.8, 0.2]])
+    np.testing.assert_allclose(false.detections, [[0.5, 0.0, 0.1, np.nan], [0.5, 0.0, 0.2, 0.3]])
+    assert false.as_dict(20)["detections"] == [[0.5, 0.0, 0.1, None], [0.5, 0.0, 0.2, 0.3]]
 
 
 def test_what_is_kept_of_many_spots_keeps_the_worst():
-    cell = bench.Cell(of=500, spots=[[0.3, float(k), 1.0, 0.1] for k in np.random.default_rng(1).permutation(400)])
+    cell = bench.Cell(of=500, detections=[[0.3, float(k), 1.0, 0.1] for k in np.random.default_rng(1).permutation(400)])
     kept = cell.as_dict(20)
     assert (kept["of"], kept["seen"]) == (500, 400)
-    assert [kept["spots"][0][1], kept["spots"][-1][1]] == [0.0, 399.0]
-    assert len(kept["spots"]) == 20
+    assert [kept["detections"][0][1], kept["detections"][-1][1]] == [0.0, 399.0]
+    assert len(kept["detections"]) == 20

@@ -10,11 +10,11 @@ from test_run import LIGHTS, STATION
 
 from lumidock.camera import Camera, save_camera
 from lumidock.datatypes import Detections, Fix, Guide, LayerPose, Match, Protection
+from lumidock.evaluation.claims import stanford
+from lumidock.evaluation.metrics import evaluate, layer_offset_m, true_poses
 from lumidock.geometry import bearing_and_range, quat_xyzw_from_rotation, so3_exp
-from lumidock.metrics import evaluate, layer_offset_m, true_poses
 from lumidock.station import load_station
-from lumidock.streams.runfolder import RunFolder
-from lumidock.trust import stanford
+from lumidock.streams.run_folder import RunFolder
 
 HEAD_ON = np.diag([1.0, -1.0, -1.0])
 TRUTH = "frame,t_ns,x_m,y_m,z_m,qx,qy,qz,qw\n"

@@ -12,14 +12,14 @@ from lumidock.camera import Camera
 from lumidock.config import ConsistencyConfig, LayersConfig, PaperConfig
 from lumidock.datatypes import Detections, Frame
 from lumidock.errors import FrameError, InputError
+from lumidock.evaluation.metrics import evaluate
 from lumidock.geometry import se3_inverse, so3_log
-from lumidock.metrics import evaluate
 from lumidock.paper import PaperLocalizer
 from lumidock.pose import project_lights
-from lumidock.reproduce.paper import TABLE_1
+from lumidock.reproduce.paper_figures import TABLE_1
+from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import Scenario, load_scenario
 from lumidock.sim.sequence import render_frame
-from lumidock.sim.spots import spot_frames
 
 STATION, CAMERA = shipped_station(), shipped_camera()
 
@@ -30,11 +30,11 @@ def head_on(z, x=0.0):
     return T
 
 
-def seen_from(T, t_ns=0, *, lights=slice(None), strays=()):
+def seen_from(T, t_ns=0, *, lights=slice(None), spurious=()):
     uv = project_lights(CAMERA, T, STATION.p_dock)[lights]
     rear = np.isin(np.arange(len(STATION))[lights], STATION.lights_of("rear")).astype(float)
-    uv = np.concatenate([uv, np.array(strays, float).reshape(-1, 2)])
-    return Detections.from_uv(str(t_ns), t_ns, uv, p_rear=np.concatenate([rear, np.zeros(len(strays))]))
+    uv = np.concatenate([uv, np.array(spurious, float).reshape(-1, 2)])
+    return Detections.from_uv(str(t_ns), t_ns, uv, p_rear=np.concatenate([rear, np.zeros(len(spurious))]))
 
 
 def error(fix, T):
@@ -65,7 +65,7 @@ def test_history_makes_tracking_and_cold_never_does():
 def test_a_missing_and_a_spurious_light_together_void_a_cold_start_but_not_a_tracked_frame():
     lights = [0, 1, 2, 4, 5, 6]
     stray = project_lights(CAMERA, head_on(9.0), np.array([[-0.5, 0.5, 0.0]]))
-    spoilt = seen_from(head_on(9.0), 450_000_000, lights=lights, strays=stray)
+    spoilt = seen_from(head_on(9.0), 450_000_000, lights=lights, spurious=stray)
     cold = PaperLocalizer(STATION, CAMERA).process_detections(spoilt)
     assert not cold.valid
     assert cold.reason == "inconsistent"
@@ -183,7 +183,7 @@ def test_a_distorted_lens_is_undone():
 
 
 def test_same_detections_give_the_same_answers():
-    frames = list(spot_frames(load_scenario("trials", ("faults.missing=2",)), STATION, CAMERA, 3))[20:40]
+    frames = list(simulated_frames(load_scenario("trials", ("faults.missing=2",)), STATION, CAMERA, 3))[20:40]
 
     def run():
         localizer = PaperLocalizer(STATION, CAMERA)

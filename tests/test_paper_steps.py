@@ -39,10 +39,10 @@ def test_swarm_names_the_lights_of_a_shifted_scaled_rolled_view(rng, seen):
 
 
 @pytest.mark.parametrize("strays", [1, 2])
-def test_swarm_leaves_strays_without_a_name(rng, strays):
+def test_swarm_leaves_strays_without_a_name(rng, spurious):
     view = similarity(FRONT, 0.05, 100.0, np.array([20.0, -30.0]))
-    view = np.concatenate([view, rng.uniform(-300, 300, (strays, 2))])
-    assert register(view, FRONT, None, PsoConfig(), rng).light.tolist() == [*range(7), *[-1] * strays]
+    view = np.concatenate([view, rng.uniform(-300, 300, (spurious, 2))])
+    assert register(view, FRONT, None, PsoConfig(), rng).light.tolist() == [*range(7), *[-1] * spurious]
 
 
 def test_residual_over_all_pairs_as_printed_has_no_minimum_at_the_alignment(rng):
@@ -105,7 +105,7 @@ def test_smaller_cluster_is_the_least_variance_split(radii):
     assert cost(small) <= min(map(cost, every)) + 1e-6
 
 
-def spots(radii, p_rear=None):
+def detections(radii, p_rear=None):
     d = Detections.from_uv("0", 0, np.zeros((len(radii), 2)))
     unknown = np.full(len(radii), np.nan)
     return Detections("0", 0, d.uv, np.array(radii, float), d.flux, d.p_light, unknown if p_rear is None else p_rear)
@@ -113,18 +113,18 @@ def spots(radii, p_rear=None):
 
 def test_radius_decides_the_layers_and_the_counter_the_last_group():
     discriminator = LayerDiscriminator(LayersConfig(dual_frames=2))
-    assert not discriminator.rear(spots([8.0] * 5)).any()  # one group before any dual frame: front
+    assert not discriminator.rear(detections([8.0] * 5)).any()  # one group before any dual frame: front
     for _ in range(3):
-        assert discriminator.rear(spots([8.0] * 5 + [3.0] * 6)).tolist() == [False] * 5 + [True] * 6
+        assert discriminator.rear(detections([8.0] * 5 + [3.0] * 6)).tolist() == [False] * 5 + [True] * 6
     assert discriminator.dual_frames == 3
-    assert discriminator.rear(spots([8.0] * 5)).all()  # one group after enough of them: rear
-    assert discriminator.rear(spots([8.0] * 9 + [3.0] * 3)).all()  # a cluster of three is no layer
+    assert discriminator.rear(detections([8.0] * 5)).all()  # one group after enough of them: rear
+    assert discriminator.rear(detections([8.0] * 9 + [3.0] * 3)).all()  # a cluster of three is no layer
 
 
 def test_colour_decides_where_there_is_any_and_is_not_asked_when_told_so():
     p_rear = np.array([0.9, 0.1, 0.6])
-    assert LayerDiscriminator(LayersConfig()).rear(spots([5, 5, 5], p_rear)).tolist() == [True, False, True]
-    assert not LayerDiscriminator(LayersConfig(method="radius")).rear(spots([5, 5, 5], p_rear)).any()
+    assert LayerDiscriminator(LayersConfig()).rear(detections([5, 5, 5], p_rear)).tolist() == [True, False, True]
+    assert not LayerDiscriminator(LayersConfig(method="radius")).rear(detections([5, 5, 5], p_rear)).any()
 
 
 def test_blue_is_read_from_the_ring_around_a_white_core():

@@ -21,14 +21,14 @@ from conftest import assert_close
 from rosbags.typesys import Stores, get_typestore
 from test_run import simulate
 
-from lumidock.calib import write_calibration
 from lumidock.camera import Camera, load_camera, save_camera
 from lumidock.datatypes import Fix, Frame
-from lumidock.metrics import evaluate
+from lumidock.evaluation.metrics import evaluate
+from lumidock.setup.calibration_files import write_calibration
 from lumidock.streams.live import open_live
 from lumidock.streams.mavlink import Mavlink
 from lumidock.streams.sources import open_source
-from lumidock.vehicle import load_vehicle
+from lumidock.streams.vehicle import load_vehicle
 
 pytestmark = pytest.mark.peers
 

@@ -5,9 +5,9 @@ import numpy as np
 from bench.shipped import shipped_camera, shipped_station
 
 from lumidock.datatypes import Detections, Fix, Match
-from lumidock.overlay import around_lights, draw, whole
 from lumidock.pose import project_lights
 from lumidock.report.stills import contact_sheet, plot_trajectory
+from lumidock.streams.overlay import around_lights, draw, whole
 
 STATION, CAMERA = shipped_station(), shipped_camera()
 
@@ -15,10 +15,10 @@ STATION, CAMERA = shipped_station(), shipped_camera()
 def fix_at(z, *, valid=True):
     T = np.diag([1.0, -1.0, -1.0, 1.0])
     T[2, 3] = z
-    spots = Detections.from_uv(
+    detections = Detections.from_uv(
         f"{z}", 0, np.concatenate([project_lights(CAMERA, T, STATION.p_dock[:7]), [[90.0, 80.0]]])
     )
-    match = Match(spots, np.array([*range(7), -1]))
+    match = Match(detections, np.array([*range(7), -1]))
     if not valid:
         return Fix(f"{z}", 0, "none", "search", 8, reason="inconsistent", match=match)
     return Fix(f"{z}", 0, "acquired", "front", 8, 7, T, match=match)

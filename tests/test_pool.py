@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lumidock.app.run import Setup, run
 from lumidock.camera import load_camera
 from lumidock.config import Config
 from lumidock.datatypes import Frame
 from lumidock.localizer import Localizer
 from lumidock.paper import PaperLocalizer
-from lumidock.run import Setup, run
 from lumidock.station import load_station
-from lumidock.streams.runfolder import RunFolder
+from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.sources import open_source
 
 POOL = Path(__file__).parents[2] / "shared" / "real" / "pool-ring"

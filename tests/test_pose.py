@@ -8,10 +8,10 @@ from conftest import assert_close, numeric_jacobian, transform
 from scipy.spatial.transform import Rotation
 
 from lumidock.camera import Camera, load_camera
+from lumidock.evaluation.claims import pose_error
 from lumidock.geometry import se3_exp
 from lumidock.pose import project_lights, project_lights_with_jacobian, reprojection_rms_px, solve_pose, sqpnp
 from lumidock.station import load_station
-from lumidock.trust import pose_error
 
 ROOT = Path(__file__).parents[1]
 K = np.array([[1400.0, 0.0, 1000.0], [0.0, 1400.0, 800.0], [0.0, 0.0, 1.0]])

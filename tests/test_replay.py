@@ -13,8 +13,8 @@ from test_run import CAMERA, simulate
 
 from lumidock.datatypes import Fix, Frame
 from lumidock.picture import encoding_of
-from lumidock.sinks import Scene, open_file_sink
 from lumidock.station import load_station
+from lumidock.streams.sinks import Scene, open_file_sink
 from lumidock.streams.sources import open_source
 
 

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from bench.shipped import CAMERA_FILE, STATION_FILE, shipped_camera, shipped_station
 
+from lumidock.app.run import Setup, run
 from lumidock.config import Config
 from lumidock.errors import InputError
 from lumidock.localizer import Localizer
-from lumidock.page import Table, markdown, render
 from lumidock.report import report
 from lumidock.report.figures import _spans, _thinned
+from lumidock.report.page import Table, markdown, render
 from lumidock.report.view import load_run
-from lumidock.run import Setup, run
 from lumidock.sim.scenario import load_scenario
 from lumidock.sim.sequence import write_detections, write_rendered
-from lumidock.streams.runfolder import RunFolder
+from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.sources import open_source
 
 CHROMIUM = shutil.which("chromium")

@@ -10,21 +10,21 @@ import pytest
 from bench.shipped import CAMERA_FILE, STATION_FILE, shipped_camera, shipped_station
 from test_report import CHROMIUM, Reader, probe
 
+from lumidock.app.run import Setup, run
 from lumidock.camera import load_camera
 from lumidock.config import Config
 from lumidock.datatypes import Detections, Fix, Match
 from lumidock.errors import InputError
 from lumidock.localizer import Localizer
 from lumidock.reproduce import FULL, QUICK, reproduce, work
+from lumidock.reproduce.experiments import jobs_of
 from lumidock.reproduce.jobs import Job, run_jobs
-from lumidock.reproduce.plan import jobs_of
 from lumidock.reproduce.trials import Counts, trial, verdict
-from lumidock.run import Setup, run
+from lumidock.sim.detections import SimulatedFrame
 from lumidock.sim.measured import measured_like
 from lumidock.sim.scenario import load_scenario, shipped_scenarios
 from lumidock.sim.sequence import write_rendered
-from lumidock.sim.spots import SpotFrame
-from lumidock.streams.runfolder import RunFolder
+from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.sources import open_source
 
 DOCK = (str(STATION_FILE), str(CAMERA_FILE))
@@ -47,8 +47,8 @@ TINY = replace(
 
 def spot_frame(light):
     n = len(light)
-    spots = Detections.from_uv("0", 0, np.arange(2.0 * n).reshape(n, 2))
-    return SpotFrame(spots, np.eye(4), np.array(light), np.zeros((13, 2)), np.ones(13, bool))
+    detections = Detections.from_uv("0", 0, np.arange(2.0 * n).reshape(n, 2))
+    return SimulatedFrame(detections, np.eye(4), np.array(light), np.zeros((13, 2)), np.ones(13, bool))
 
 
 def answer(frame, light, status="acquired"):
@@ -81,7 +81,7 @@ def test_trial_is_the_same_every_time_and_counts_no_frame_twice():
 
 def test_what_is_done_is_not_done_again_and_what_changed_is(tmp_path):
     settings = ["path.count=3"]
-    job = Job("cold", 1.0, work.cold_start, (DOCK, "missing-1", settings, 3))
+    job = Job("cold", 1.0, work.acquisition_trial, (DOCK, "missing-1", settings, 3))
     seen = []
     first = run_jobs([job], tmp_path, "dock", workers=0)
     file = tmp_path / "cold.json"
@@ -135,7 +135,7 @@ def test_every_shipped_docking_is_run_at_point_level_with_the_detectors_errors(t
         for seed in range(20):
             _, scenario, (setting,), first, stop = jobs[f"point-{name}-{FULL.first_seed + seed}"].arguments
             assert (scenario, first, stop) == (name, FULL.first_seed + seed, FULL.first_seed + seed + 1)
-            assert setting == f"spots.detector={measured_like(load_scenario(name))}"
+            assert setting == f"detections.detector={measured_like(load_scenario(name))}"
     assert len(jobs) == 20 * len(paths)
     counts = jobs[f"point-rectangle-{FULL.first_seed}"].call(*jobs[f"point-rectangle-{FULL.first_seed}"].arguments)
     assert counts["counts"]["frames"] == 127

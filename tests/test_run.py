@@ -8,17 +8,17 @@ import pytest
 import yaml
 from numpy.testing import assert_array_equal
 
+from lumidock.app.run import Setup, Summary
+from lumidock.app.run import run as run_source
 from lumidock.camera import Camera, load_camera, save_camera
 from lumidock.config import Config
 from lumidock.datatypes import Fix, Guide
 from lumidock.errors import InputError
 from lumidock.paper import PaperLocalizer
-from lumidock.run import Setup, Summary
-from lumidock.run import run as run_source
 from lumidock.sim.scenario import load_scenario
 from lumidock.sim.sequence import write_detections, write_rendered
 from lumidock.station import load_station
-from lumidock.streams.runfolder import RunFolder, sha256
+from lumidock.streams.run_folder import RunFolder, sha256
 from lumidock.streams.sources import open_source
 
 CAMERA = Camera(320, 256, np.array([[273.0, 0, 159.5], [0, 273.0, 127.5], [0, 0, 1]]))

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lumidock import detect
-from lumidock._kernels.saturation import SATURATED
+from lumidock._kernels.detection.saturation import SATURATED
 from lumidock.config import DetectConfig
 from lumidock.datatypes import Frame
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from commandline import wait_for
 
+from lumidock.app.serve import Camera, Done, Newest, Server, Taken, Worker
 from lumidock.datatypes import Fix, Frame
-from lumidock.serve import Camera, Done, Newest, Server, Taken, Worker
 from lumidock.streams.healthpage import HealthPage
 
 IMAGE = np.zeros((8, 8), np.uint8)
@@ -117,7 +117,7 @@ def test_what_is_stale_is_not_sent():
 
 
 def test_a_viewer_begins_when_the_vehicle_has_been_told(monkeypatch):
-    monkeypatch.setattr("lumidock.serve._AFTER_YOU_S", 0.2)
+    monkeypatch.setattr("lumidock.app.serve._AFTER_YOU_S", 0.2)
     began = {}
     workers = [
         Worker(name, lambda name=name: Recorder(lambda _: began.setdefault(name, time.monotonic())), queue=5, **options)
@@ -134,7 +134,7 @@ def test_a_viewer_begins_when_the_vehicle_has_been_told(monkeypatch):
 
 
 def test_a_sink_that_hangs_is_left_behind(monkeypatch):
-    monkeypatch.setattr("lumidock.serve._CLOSING_S", 0.1)
+    monkeypatch.setattr("lumidock.app.serve._CLOSING_S", 0.1)
     release = threading.Event()
     sink = Recorder(lambda _: release.wait(60))
     worker = Worker("w", lambda: sink, queue=5)
@@ -181,7 +181,7 @@ def test_a_blocked_client_and_a_full_disk_do_not_delay_the_vehicle():
 
 
 def test_a_lost_camera_is_opened_again(monkeypatch):
-    monkeypatch.setattr("lumidock.serve._RETRY_S", 0.05)
+    monkeypatch.setattr("lumidock.app.serve._RETRY_S", 0.05)
     tries = []
 
     def items():
@@ -201,7 +201,7 @@ def test_a_lost_camera_is_opened_again(monkeypatch):
 
 def test_a_recording_is_shown_at_its_own_pace_and_again(monkeypatch):
     """A busy machine may drop pictures, never show one early."""
-    monkeypatch.setattr("lumidock.serve._LOOP_PAUSE_NS", 50_000_000)
+    monkeypatch.setattr("lumidock.app.serve._LOOP_PAUSE_NS", 50_000_000)
     last_ns, began = 350_000_000, time.monotonic()
     shown_s = {}
     frames = [Frame(str(i), i * 50_000_000, IMAGE) for i in range(4)]

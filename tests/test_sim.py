@@ -11,6 +11,7 @@ from bench.shipped import shipped_camera, shipped_station
 from lumidock.errors import InputError
 from lumidock.geometry import so3_exp, so3_log
 from lumidock.pose import project_lights
+from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import (
     R_DOCK_CAM_HEAD_ON,
     load_scenario,
@@ -19,7 +20,6 @@ from lumidock.sim.scenario import (
     trajectory,
 )
 from lumidock.sim.sequence import write_detections
-from lumidock.sim.spots import spot_frames
 
 STATION, CAMERA = shipped_station(), shipped_camera()
 
@@ -70,9 +70,9 @@ def test_shipped_scenarios_load_and_say_what_they_are(name):
         "faults.spurious=100000",
         "faults.missing=[3, 1]",
         "faults.missing=[1, 2, 3]",
-        "spots.rear_range_m=-1",
-        "spots.mirror=only",
-        "spots.black_outs.at_s=[[3, 1]]",
+        "detections.rear_range_m=-1",
+        "detections.mirror=only",
+        "detections.black_outs.at_s=[[3, 1]]",
         "path.speed_spread_m_s=1.0",
         "path={kind: draws, count: 100000, hold: 2}",
         "path={kind: draws, hold: 1000}",
@@ -93,8 +93,8 @@ def test_bad_settings_are_refused_in_one_line(setting):
 
 
 def test_spots_have_the_truth_they_claim():
-    scenario = load_scenario("trials", ("faults.missing=2", "faults.spurious=3", "spots.noise_px=0.0"))
-    for frame in spot_frames(scenario, STATION, CAMERA, 4):
+    scenario = load_scenario("trials", ("faults.missing=2", "faults.spurious=3", "detections.noise_px=0.0"))
+    for frame in simulated_frames(scenario, STATION, CAMERA, 4):
         named = frame.light >= 0
         assert (~named).sum() == 3
         np.testing.assert_allclose(frame.detections.uv[named], frame.uv[frame.light[named]])
@@ -106,7 +106,7 @@ def test_spots_have_the_truth_they_claim():
 
 
 def frames_of(name, *settings, seed=0, station=STATION):
-    return list(spot_frames(load_scenario(name, settings), station, CAMERA, seed))
+    return list(simulated_frames(load_scenario(name, settings), station, CAMERA, seed))
 
 
 def named(frame):
@@ -126,7 +126,7 @@ def test_rotations_are_those_of_one_at_a_time(rng):
 
 @pytest.mark.parametrize("name", ["nominal", "joint", "three-lights", "rectangle"])
 def test_truth_of_spots_is_the_projection_from_the_true_pose(name):
-    settings = ("spots.survey=false", "spots.calibration=false", "spots.noise_px=0")
+    settings = ("detections.survey=false", "detections.calibration=false", "detections.noise_px=0")
     for frame in frames_of(name, *settings)[::7]:
         uv = project_lights(CAMERA, frame.T_dock_cam, STATION.p_dock)
         np.testing.assert_allclose(frame.uv, uv, atol=1e-9)
@@ -152,7 +152,7 @@ def test_faults_do_not_change_the_path():
 
 
 def test_draws_are_spread_and_have_the_front_layer_in_view():
-    frames = frames_of("missing-spurious", "path.count=2000", "spots.noise_px=0")
+    frames = frames_of("missing-spurious", "path.count=2000", "detections.noise_px=0")
     z = np.array([frame.T_dock_cam[2, 3] for frame in frames])
     np.testing.assert_allclose(np.percentile(z, [0, 25, 50, 75, 100]), [3, 7, 11, 15, 19], atol=0.5)
     tilt, roll = turns(frames)
@@ -189,8 +189,8 @@ def test_held_frames_move_slowly_and_miss_the_same_lights():
     assert np.diff(stamps[:, 0]).min() > 10e9
     seen = np.array([named(frame) for frame in frames]).reshape(50, 5, 3)
     assert (seen == seen[:, :1]).all()
-    strays = np.array([frame.detections.uv[3:] for frame in frames]).reshape(50, 5, -1)
-    assert (strays[:, 0] != strays[:, 1]).all()
+    spurious = np.array([frame.detections.uv[3:] for frame in frames]).reshape(50, 5, -1)
+    assert (spurious[:, 0] != spurious[:, 1]).all()
     T = np.array([frame.T_dock_cam for frame in frames]).reshape(50, 5, 4, 4)
     np.testing.assert_allclose(np.diff(T[:, :, 2, 3]), -0.5 / 15, rtol=1e-5)
     moved = np.linalg.norm(np.diff(T[:, :, :3, 3], axis=1), axis=2) * 15
@@ -199,7 +199,7 @@ def test_held_frames_move_slowly_and_miss_the_same_lights():
 
 
 def test_beside_is_beside():
-    for frame in frames_of("beside", "path.count=100", "spots.noise_px=0"):
+    for frame in frames_of("beside", "path.count=100", "detections.noise_px=0"):
         corners = frame.uv[:7].min(axis=0), frame.uv[:7].max(axis=0)
         margin = 0.25 * (corners[1] - corners[0])
         stray = frame.detections.uv[frame.light < 0]
@@ -229,7 +229,7 @@ def test_survey_errors_have_their_sigmas():
     straight = "path={start_z_m: 19, end_z_m: 18, sway_m: [0, 0, 0], sway_deg: [0, 0, 0]}"
     off_m = []
     for seed in range(400):
-        frame = frames_of("approach", straight, "spots.survey=true", seed=seed)[0]
+        frame = frames_of("approach", straight, "detections.survey=true", seed=seed)[0]
         uv = project_lights(CAMERA, frame.T_dock_cam, STATION.p_dock)
         off_m.append((frame.uv - uv)[:7] * 19.0 / CAMERA.K[0, 0])
     common = np.mean(off_m, axis=1, keepdims=True)
@@ -238,7 +238,7 @@ def test_survey_errors_have_their_sigmas():
 
 
 def test_errors_of_survey_and_lens_last_for_a_sequence():
-    frames = frames_of("three-lights", "path.count=50", "spots.survey=true", "spots.calibration=true")
+    frames = frames_of("three-lights", "path.count=50", "detections.survey=true", "detections.calibration=true")
     off = [frame.uv[:7] - project_lights(CAMERA, frame.T_dock_cam, STATION.p_dock[:7]) for frame in frames]
     off = np.array(off).reshape(50, 5, -1)
     assert np.abs(off - off[:, :1]).max() < 1.5
@@ -247,7 +247,9 @@ def test_errors_of_survey_and_lens_last_for_a_sequence():
 
 def test_calibration_errors_have_their_sigmas():
     exact = replace(STATION, sigma_light_m=0.0, sigma_layer_m=0.0)
-    frames = frames_of("joint", "spots.calibration=true", "spots.survey=true", "path.count=1000", station=exact)
+    frames = frames_of(
+        "joint", "detections.calibration=true", "detections.survey=true", "path.count=1000", station=exact
+    )
     errors = []
     for frame in frames:
         uv = project_lights(CAMERA, frame.T_dock_cam, STATION.p_dock)
@@ -260,7 +262,7 @@ def test_calibration_errors_have_their_sigmas():
 
 
 def test_a_path_has_one_survey_error_through_the_run():
-    frames = frames_of("nominal", "spots.drop=0.0")
+    frames = frames_of("nominal", "detections.drop=0.0")
     near = [frame for frame in frames if 2.0 < frame.T_dock_cam[2, 3] < 6.0]
     off = [frame.uv[7:] - project_lights(CAMERA, frame.T_dock_cam, STATION.p_dock)[7:] for frame in near]
     assert np.abs(off).max() > 0.5
@@ -268,7 +270,7 @@ def test_a_path_has_one_survey_error_through_the_run():
 
 
 def test_nominal_is_what_it_says():
-    dead, strays, speed = [], [], []
+    dead, spurious, speed = [], [], []
     for seed in range(30):
         frames = frames_of("nominal", "path.frame_interval_s=0.5", seed=seed)
         reach = np.array([np.linalg.norm(frame.T_dock_cam[:3, 3]) for frame in frames])
@@ -279,16 +281,16 @@ def test_nominal_is_what_it_says():
         lit = np.zeros(13, bool)
         for frame in frames:
             lit[named(frame)] = True
-            strays.append((frame.light < 0).sum())
+            spurious.append((frame.light < 0).sum())
         dead.append(13 - lit.sum())
     assert set(dead) == {0, 1, 2, 3}
     assert 0.68 < min(speed) < 0.8 < 1.2 < max(speed) < 1.32
-    assert min(strays) == 0
-    assert np.mean(strays) == pytest.approx(2.5, abs=0.5)
+    assert min(spurious) == 0
+    assert np.mean(spurious) == pytest.approx(2.5, abs=0.5)
 
 
 def test_nothing_is_seen_in_a_black_out():
-    frames = frames_of("nominal", "spots.black_outs.at_s=[[15, 16.5], [20, 20.3]]")
+    frames = frames_of("nominal", "detections.black_outs.at_s=[[15, 16.5], [20, 20.3]]")
     t = np.array([frame.detections.t_ns for frame in frames]) * 1e-9
     black = ((t >= 15) & (t <= 16.5)) | ((t >= 20) & (t <= 20.3))
     assert all(len(frame.detections) == 0 for frame, out in zip(frames, black, strict=True) if out)
@@ -298,7 +300,7 @@ def test_nothing_is_seen_in_a_black_out():
 
 
 def test_the_mirror_image_is_seen_alone():
-    frames = frames_of("mirror-only", "path.count=200", "spots.noise_px=0")
+    frames = frames_of("mirror-only", "path.count=200", "detections.noise_px=0")
     for frame in frames:
         assert (frame.light == -1).all()
         assert not frame.in_view.any()
@@ -321,7 +323,7 @@ def test_clutter_alone_has_no_dock():
 
 
 def test_attitude_sensor_has_a_bias_for_the_run_and_little_noise():
-    settings = ("spots.attitude={bias_deg: 2.0, noise_deg: 0.1}", "path.frame_interval_s=0.5")
+    settings = ("detections.attitude={bias_deg: 2.0, noise_deg: 0.1}", "path.frame_interval_s=0.5")
     biases = []
     for seed in range(60):
         frames = frames_of("nominal", *settings, seed=seed)
@@ -358,7 +360,7 @@ def read(path):
 def test_detections_folder_says_what_was_seen(tmp_path):
     scenario = load_scenario("trials", ("faults.missing=1",))
     frames = write_detections(scenario, STATION, CAMERA, 0, tmp_path)
-    truth, spots = read(tmp_path / "lights_truth.csv"), read(tmp_path / "detections.csv")
+    truth, detections = read(tmp_path / "lights_truth.csv"), read(tmp_path / "detections.csv")
     assert frames == len(read(tmp_path / "timestamps.csv"))
-    assert sum(row["visible"] == "1" for row in truth) == len(spots)
+    assert sum(row["visible"] == "1" for row in truth) == len(detections)
     assert (tmp_path / "camera.yaml").exists()

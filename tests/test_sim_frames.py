@@ -15,10 +15,10 @@ from lumidock.camera import Camera, load_camera
 from lumidock.errors import InputError
 from lumidock.pose import project_lights
 from lumidock.sim import knobs
-from lumidock.sim.plan import controlled, metered, plan_of
+from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import R_DOCK_CAM_HEAD_ON, Scenario, load_scenario, shipped_scenarios
+from lumidock.sim.schedule import controlled, metered, schedule_of
 from lumidock.sim.sequence import render_frame, rendered, write_detections, write_rendered
-from lumidock.sim.spots import spot_frames
 from lumidock.sim.stream import rows_of
 from lumidock.streams.images import read_image
 from lumidock.streams.sources import open_source
@@ -49,7 +49,7 @@ def written(out, name, *settings, seed=3, workers=1, camera=SMALL, video=False):
 
 def electrons(name, z, *settings, seed=0):
     scenario = load_scenario(name, settings)
-    plan = plan_of(scenario, STATION, SMALL, seed)
+    plan = schedule_of(scenario, STATION, SMALL, seed)
     moment = replace(plan.moment(0), T_dock_cam=head_on(z), T_cam_later=np.eye(4))
     return plan.studio(0).shoot(moment)
 
@@ -95,7 +95,7 @@ def test_truth_of_a_rendered_light_is_its_projection_and_its_picture_is_there(tm
     poses = {row["frame"]: row for row in read(out / "truth.csv")}
     assert poses
     scenario = load_scenario("approach", (*FEW, "path.start_z_m=9", "path.end_z_m=2"))
-    plan = plan_of(scenario, STATION, CAMERA, 3)
+    plan = schedule_of(scenario, STATION, CAMERA, 3)
     for number in range(len(plan)):
         uv = project_lights(CAMERA, plan.course.T_dock_cam[number], STATION.p_dock)
         image = read_image(out / "frames" / f"{number:06d}.jpg")
@@ -109,7 +109,7 @@ def test_truth_of_a_rendered_light_is_its_projection_and_its_picture_is_there(tm
 def test_snr_is_what_a_matched_filter_measures(rng):
     """Truth's ratio against the scatter of a filter's output over noisy read-outs, far, dim and among neighbours."""
     scenario = load_scenario("approach", ("output.color=false", "output.pixels=mono16", "output.file=png"))
-    plan = plan_of(scenario, STATION, CAMERA, 0)
+    plan = schedule_of(scenario, STATION, CAMERA, 0)
     studio = plan.studio(0)
     moment = replace(plan.moment(0), T_dock_cam=head_on(26.0), T_cam_later=np.eye(4))
     shot = studio.shoot(moment)
@@ -148,7 +148,7 @@ def test_dark_hidden_and_failed_lamps_are_not_visible(rng):
     assert not seen.lit[2]
     assert snr[:2].min() > 100
     failed = load_scenario("approach", (*FEW, "lamps.failures={F1: 0.0, F2: 100.0}"))
-    assert plan_of(failed, STATION, SMALL, 0).moment(1).dark.tolist() == [0]
+    assert schedule_of(failed, STATION, SMALL, 0).moment(1).dark.tolist() == [0]
     hidden = electrons("approach", 6.0, "around.hull=0.9")
     assert hidden.snr[:7].min() < 8 < electrons("approach", 6.0).snr[:7].min()
     assert electrons("front-only", 6.0).snr[7:13].max() == 0.0
@@ -176,7 +176,7 @@ def test_what_shines_beside_the_dock_is_in_the_truth(tmp_path):
 
 def test_snow_keeps_its_place_while_the_camera_moves():
     scenario = load_scenario("headlamp", ("around.snow={drift_m_s: [0, 0, 0]}",))
-    plan = plan_of(scenario, STATION, SMALL, 0)
+    plan = schedule_of(scenario, STATION, SMALL, 0)
 
     def particles(z):
         moment = replace(plan.moment(0), T_dock_cam=head_on(z), T_cam_later=np.eye(4))
@@ -192,7 +192,7 @@ def test_auto_exposure_settles_at_its_mean_and_gives_way_to_bright_lamps():
     settings = ("path.frame_interval_s=1.5", "sensor.auto_exposure={min_ms: 0.01}", "sensor.exposure_ms=0.2")
     settings += ("output={pixels: mono8, color: false}",)
     scenario = load_scenario("approach", settings)
-    plan = plan_of(scenario, STATION, SMALL, 0)
+    plan = schedule_of(scenario, STATION, SMALL, 0)
     light = [metered(plan, number) for number in range(len(plan))]
     exposure_s = controlled(plan, scenario.sensor.auto_exposure, light)
     assert exposure_s[0] == pytest.approx(0.2e-3)
@@ -253,7 +253,7 @@ def test_absurd_settings_are_refused_or_simulated(section, tmp_path):
         for value in ("1e-300", "1e300", "[1e-300, 1e-300]", "[1e300, 1e300]", "[1e300, 1e300, 1e300]"):
             try:
                 scenario = load_scenario("approach", (*path, f"{name}={value}"))
-                list(spot_frames(scenario, STATION, SMALL, 0))
+                list(simulated_frames(scenario, STATION, SMALL, 0))
                 rendered(scenario, STATION, SMALL, 0, tmp_path)
             except InputError as error:
                 refusals.append(str(error))
@@ -274,7 +274,7 @@ def test_a_wrong_calibration_is_wrong_by_what_it_says(tmp_path):
     out = written(tmp_path, "wrong-calibration")
     assert load_camera(out / "camera.yaml").K.tolist() == SMALL.K.tolist()
     lights = {row["light"]: float(row["u_px"]) for row in read(out / "lights_truth.csv") if row["frame"] == "000006"}
-    plan = plan_of(load_scenario("wrong-calibration", FEW), STATION, SMALL, 3)
+    plan = schedule_of(load_scenario("wrong-calibration", FEW), STATION, SMALL, 3)
     believed = project_lights(SMALL, plan.course.T_dock_cam[6], STATION.p_dock)
     apart = (lights["F7"] - lights["F1"]) / (believed[6, 0] - believed[0, 0])
     assert apart == pytest.approx(1.03, abs=1e-4)
@@ -284,7 +284,7 @@ def test_a_port_is_seen_through_and_its_calibration_is_written(tmp_path):
     out = written(tmp_path, "flat-port", camera=CAMERA)
     held, truth = load_camera(out / "camera.yaml"), read(out / "lights_truth.csv")
     assert held.distortion[0] > 0.1
-    plan = plan_of(load_scenario("flat-port", FEW), STATION, CAMERA, 3)
+    plan = schedule_of(load_scenario("flat-port", FEW), STATION, CAMERA, 3)
     for row in truth:
         believed = project_lights(held, plan.course.T_dock_cam[int(row["frame"])], STATION.p_dock)
         off = believed[STATION.ids.index(row["light"])] - [float(row["u_px"]), float(row["v_px"])]

@@ -15,15 +15,15 @@ from test_run import CAMERA, simulate
 from lumidock import cli
 from lumidock.datatypes import Detections, Fix, Frame, Guide, Match, Protection, Unusable
 from lumidock.errors import InputError
-from lumidock.export import export
 from lumidock.geometry import se3_inverse
-from lumidock.sinks import Scene, open_file_sink
 from lumidock.station import load_station
+from lumidock.streams.export import export
 from lumidock.streams.mp4 import Mp4
 from lumidock.streams.replay import read_fixes
-from lumidock.streams.runfolder import RunFolder
+from lumidock.streams.run_folder import RunFolder
+from lumidock.streams.sinks import Scene, open_file_sink
 from lumidock.streams.sources import open_source
-from lumidock.vehicle import load_vehicle
+from lumidock.streams.vehicle import load_vehicle
 
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 TOLD = ("frame", "status", "stage", "n_seen", "n_used", "reason", "guide", "protection")

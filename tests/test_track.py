@@ -25,10 +25,11 @@ from tracks import (
     spots_at,
 )
 
-from lumidock import integrity, match, track, trust
-from lumidock._kernels import track as kernel
-from lumidock._kernels.levels import outputs
+from lumidock import integrity, match, track
+from lumidock._kernels.tracking import track as kernel
+from lumidock._kernels.tracking.levels import outputs
 from lumidock.datatypes import Attitude
+from lumidock.evaluation import claims
 from lumidock.geometry import bearing_and_range, se3_adjoint, se3_exp, se3_inverse, so3_exp, so3_log
 from lumidock.localizer import Localizer
 
@@ -36,7 +37,7 @@ from lumidock.localizer import Localizer
 @cache
 def followed():
     """The first belief of a localizer after each of 100 frames of the approach in which the second layer appears."""
-    settings = ("path.start_z_m=18", "path.end_z_m=11", "path.frame_interval_s=0.0666667", "spots.survey=true")
+    settings = ("path.start_z_m=18", "path.end_z_m=11", "path.frame_interval_s=0.0666667", "detections.survey=true")
     localizer, beliefs = Localizer(STATION, CAMERA), []
     for frame in frames_of("approach", *settings)[:100]:
         localizer.process_detections(frame.detections)
@@ -66,7 +67,7 @@ def jacobian(belief, lights):
     return numeric_jacobian(function, np.zeros(n), step=1e-5)
 
 
-def claims(belief):
+def claimed(belief):
     """Covariance (6, 6) in dock axes and the pose of a belief."""
     bound = integrity.bounds([belief], CONFIG.integrity)
     return bound.covariance, bound.T_dock_cam
@@ -189,7 +190,7 @@ def test_survey_and_calibration_are_only_considered_before_both_layers_are_seen(
 
 def test_cold_frames_are_as_far_off_as_they_say():
     """Both layers in view, lights and lens off by what the station allows: mean NEES of the pose."""
-    settings = ("path.count=200", "spots.drop=0.0", "spots.survey=true", "spots.calibration=true")
+    settings = ("path.count=200", "detections.drop=0.0", "detections.survey=true", "detections.calibration=true")
     squares = []
     for frame in frames_of("joint", *settings, seed=8):
         name = np.full(M, -1, np.int64)
@@ -198,8 +199,8 @@ def test_cold_frames_are_as_far_off_as_they_say():
         slow = track.slow_states(STATION, None)
         guess = se3_inverse(frame.T_dock_cam)
         belief = track.start(guess, name, 0, seen, PLAN, PRIOR, slow, CONFIG.track)
-        P, T_dock_cam = claims(belief)
-        squares.append(trust.nees(trust.pose_error(T_dock_cam, frame.T_dock_cam)[None], P[None])[0])
+        P, T_dock_cam = claimed(belief)
+        squares.append(claims.nees(claims.pose_error(T_dock_cam, frame.T_dock_cam)[None], P[None])[0])
     assert len(squares) == 200
     assert 5.0 < np.mean(squares) < 7.0
 
@@ -222,7 +223,7 @@ def test_leaving_a_light_out_does_what_apart_says(rng):
         less = track.update(before, name, seen, PLAN, CONFIG.track)
         T_full, T_less = se3_inverse(full.T_cam_dock), se3_inverse(less.T_cam_dock)
         guide = np.array(bearing_and_range(T_less)) - np.array(bearing_and_range(T_full))
-        moved = np.concatenate([trust.pose_error(T_full, T_less), guide])  # an error is estimate minus truth
+        moved = np.concatenate([claims.pose_error(T_full, T_less), guide])  # an error is estimate minus truth
         sigma = np.sqrt(np.diagonal(nine(full)))
         assert_close(full.apart[c, :9] / sigma, moved / sigma, atol=0.02)
         added = np.diagonal(nine(less)) - np.diagonal(nine(full))

@@ -7,9 +7,9 @@ import pytest
 from bench.shipped import shipped_camera, shipped_station
 from test_run import simulate
 
+from lumidock.app.warm import warm_up
 from lumidock.localizer import Localizer
 from lumidock.paper import PaperLocalizer
-from lumidock.warm import warm_up
 
 COUNT = """
 import gc, sys
@@ -21,7 +21,7 @@ from lumidock.datatypes import Frame
 from lumidock.localizer import Localizer
 from lumidock.station import load_station
 from lumidock.streams.sources import open_source
-from lumidock.warm import warm_up
+from lumidock.app.warm import warm_up
 
 def compiled():
     kernels = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]

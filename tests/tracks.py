@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from lumidock import match, track
-from lumidock._kernels import track as kernel
+from lumidock._kernels.tracking import track as kernel
 from lumidock.camera import load_camera
 from lumidock.config import Config
 from lumidock.datatypes import Detections
 from lumidock.geometry import se3_exp, se3_inverse
+from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import load_scenario
-from lumidock.sim.spots import spot_frames
 from lumidock.station import load_station
 
 ROOT = Path(__file__).parents[1]
@@ -26,7 +26,7 @@ STEP_NS = 66_666_700
 
 
 def frames_of(scenario, *settings, seed=0):
-    return list(spot_frames(load_scenario(scenario, settings), STATION, CAMERA, seed))
+    return list(simulated_frames(load_scenario(scenario, settings), STATION, CAMERA, seed))
 
 
 def head_on(z=8.0, off=(0.2, -0.3)):

@@ -126,7 +126,7 @@ class PaperConfig(Section):
     layers: LayersConfig = LayersConfig()
     pso: PsoConfig = PsoConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
-    max_spots: PositiveInt = 200  # a frame with more is refused: `too_many`
+    max_detections: PositiveInt = 200  # a frame with more is refused: `too_many`
     max_lights: PositiveInt = 40  # of a layer; the ratio filter looks at all triples
     btekf: BtekfConfig = BtekfConfig()
     pose: PoseConfig = PoseConfig()
@@ -139,7 +139,7 @@ class DetectConfig(Section):
     min_snr: PositiveFloat = 6.0  # of a spot; a small one's is that of a matched filter
     min_noise: PositiveFloat = 0.7  # steps of the sensor; rounding alone leaves 0.3
     ring_px: PositiveFloat = 8.0  # radius of the ring that is a small spot's background; larger spots take 3 radii
-    max_spots: PositiveInt = 100  # in a frame; the strongest are kept
+    max_detections: PositiveInt = 100  # in a frame; the strongest are kept
     max_candidates: PositiveInt = 1500  # tiles looked at in a frame, the most outstanding ...
     max_measured: PositiveInt = 300  # ... and those of them that are worth a measurement, the brightest
     max_radius: Fraction = 0.06  # of the picture's longer side
@@ -206,11 +206,11 @@ class MatchConfig(Section):
     near_m: PositiveFloat = 0.3
     far_m: PositiveFloat = 40.0  # of a light
     hypotheses: PositiveInt = 64
-    least_spots: PositiveInt = 16  # of more detections only the likeliest lamps are looked at, ...
-    spots_per_light: PositiveInt = 2  # ... so many, or this times the station's lights
+    least_detections: PositiveInt = 16  # of more detections only the likeliest lamps are looked at, ...
+    detections_per_light: PositiveInt = 2  # ... so many, or this times the station's lights
     max_pairs: PositiveInt = 40_000  # pairs looked at in a frame, some 1.5 us each; a frame that wants more is refused
     log_dock: float = 2.0  # log prior odds that the dock is in view at all
-    max_spots_three: PositiveInt = 14  # among more, three lights of a layer say nothing
+    max_detections_three: PositiveInt = 14  # among more, three lights of a layer say nothing
     sure: PositiveFloat = 15.0  # log evidence above which three lights of each layer need not be looked for
     margin: PositiveFloat = 6.9  # log odds of the names on one frame, ln 1000
     margin_gathered: PositiveFloat = 9.2  # over frames, or with three lights; of names that one frame alone may prove

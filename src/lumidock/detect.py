@@ -17,10 +17,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import detect as kernels
-from lumidock._kernels import fields, patch, tiles
-from lumidock._kernels.samples import picture
-from lumidock._kernels.saturation import SATURATED
+from lumidock._kernels.detection import detect as kernels
+from lumidock._kernels.detection import fields, patch, tiles
+from lumidock._kernels.detection.samples import picture
+from lumidock._kernels.detection.saturation import SATURATED
 from lumidock.config import DetectConfig
 from lumidock.datatypes import Array, Detections, Frame
 
@@ -67,9 +67,9 @@ class Scan:
         least_noise = config.min_noise * (1.0 if dtype == np.uint8 else _TWELVE_BITS * shown.scale)
         self.q = _parameters(config, max(height, width), least_noise, planes == 4 or dtype != np.uint8)
         self.most = (config.max_candidates, config.max_measured)
-        self.spots, self.count = np.empty((config.max_spots, fields.COLUMNS)), 0
-        self.rects = np.empty((config.max_spots + 1, 4), np.int64)
-        self.past = np.empty((config.max_spots, fields.FLUX + 1))
+        self.spots, self.count = np.empty((config.max_detections, fields.COLUMNS)), 0
+        self.rects = np.empty((config.max_detections + 1, 4), np.int64)
+        self.past = np.empty((config.max_detections, fields.FLUX + 1))
         self.part = -1  # of SWEEP, whose turn it is; nothing was seen yet
         self.t_ns: int | None = None
         self.saw_all = False

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from lumidock._kernels.levels import levels
+from lumidock._kernels.tracking.levels import levels
 from lumidock.config import IntegrityConfig
 from lumidock.datatypes import Array, Guide, Protection, Stage
 from lumidock.match import Plan

@@ -7,9 +7,9 @@ from functools import cache
 
 import numpy as np
 
-from lumidock._kernels.colors import colors
-from lumidock._kernels.samples import picture
-from lumidock._kernels.saturation import SATURATED
+from lumidock._kernels.detection.colors import colors
+from lumidock._kernels.detection.samples import picture
+from lumidock._kernels.detection.saturation import SATURATED
 from lumidock.config import LabelConfig
 from lumidock.datatypes import Array, Detections, Frame, Indices
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lumidock import detect, integrity, layers, match, track, verify
-from lumidock._kernels.track import Foreseen
+from lumidock._kernels.tracking.track import Foreseen
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Fix, Frame, Match, Stage, Status

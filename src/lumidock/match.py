@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lumidock._kernels import evidence as kernel
-from lumidock._kernels.evidence import Naming, Scene
-from lumidock._kernels.rivals import other_pose, rivals
-from lumidock._kernels.search import Goal, Listed, search
+from lumidock._kernels.matching import evidence as kernel
+from lumidock._kernels.matching.evidence import Naming, Scene
+from lumidock._kernels.matching.rivals import other_pose, rivals
+from lumidock._kernels.matching.search import Goal, Listed, search
 from lumidock.camera import Camera
 from lumidock.config import MatchConfig, PriorConfig
 from lumidock.datatypes import Array, Attitude, Detections, Indices
@@ -306,7 +306,7 @@ def _search(ask: _Question, scene: Scene, floor: int, *leasts: int, best: float 
         goal = Goal(bounds, budget, np.array([max(best, listed.scores[:count].max(initial=_NONE))]))
         count = search(scene, plan.pairs, plan.unseen, goal, count, listed)
         sure = count > 0 and listed.scores[:count].max() > ask.config.sure
-        if sure or len(ask.scene.uv) > ask.config.max_spots_three:
+        if sure or len(ask.scene.uv) > ask.config.max_detections_three:
             break
     order = np.argsort(-listed.scores[:count], kind="stable")
     names, scores, Rs, ts = listed
@@ -348,7 +348,7 @@ def acquire(found: Spots, plan: Plan, camera: Camera, expected: Prior, config: M
 
     Of many detections those that look least like lamps stay out.
     """
-    likely = _likeliest(found, max(config.least_spots, config.spots_per_light * len(plan.p_dock)))
+    likely = _likeliest(found, max(config.least_detections, config.detections_per_light * len(plan.p_dock)))
     if likely is not None:
         part = replace(found, **{key: getattr(found, key)[likely] for key in ("uv", "cov", "var", "like", "p_light")})
         return _renamed(acquire(part, plan, camera, expected, config), likely)

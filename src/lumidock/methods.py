@@ -15,7 +15,7 @@ from lumidock.station import Station
 METHODS = ("lumidock", "paper")
 
 
-class TwoDoors(Protocol):
+class Method(Protocol):
     """What every method offers: an image door and a light door."""
 
     def process(self, frame: Frame) -> Fix:
@@ -37,7 +37,7 @@ def require_method(name: str) -> None:
         raise InputError(f"--method {name}: no such method; there are {' and '.join(METHODS)}")
 
 
-def localizer_of(method: str, station: Station, camera: Camera, config: Config, *, cold: bool = False) -> TwoDoors:
+def localizer_of(method: str, station: Station, camera: Camera, config: Config, *, cold: bool = False) -> Method:
     """A localizer by the name of its method; a `cold` one forgets all history before each frame.
 
     Raises: InputError for a method that there is not, or a station that it cannot tell apart.

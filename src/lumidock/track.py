@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lumidock._kernels import association
-from lumidock._kernels import track as kernel
-from lumidock._kernels.track import Foreseen, State
-from lumidock._kernels.update import Pixels, take_in
+from lumidock._kernels.tracking import association
+from lumidock._kernels.tracking import track as kernel
+from lumidock._kernels.tracking.track import Foreseen, State
+from lumidock._kernels.tracking.update import Pixels, take_in
 from lumidock.config import Config, TrackConfig
 from lumidock.datatypes import Array, Attitude, Indices
 from lumidock.match import Plan, Prior, Spots

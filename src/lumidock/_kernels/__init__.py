@@ -42,7 +42,7 @@ def _anything() -> None:
 
 def _remove_stale() -> None:
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     if (folder := _anything.stats.cache_path) is None:
         return

@@ -15,7 +15,7 @@ import cv2
 import typer
 
 from lumidock.camera import load_camera, save_camera
-from lumidock.cli import calibration, evaluation, exporting, inspection, machine, reporting, serving, stations
+from lumidock.cli import calibration, doctoring, evaluation, exporting, inspection, reporting, serving, stations
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
@@ -64,7 +64,7 @@ _COMMANDS = (
     serving,
     calibration,
     stations,
-    machine,
+    doctoring,
 )  # importing them adds their commands
 
 
@@ -148,9 +148,9 @@ def _run(
     as_json: AsJson = False,
 ) -> None:
     """Find the camera's pose in every frame of SOURCE."""
-    from lumidock.run import Setup
-    from lumidock.run import run as run_source
-    from lumidock.streams.runfolder import RunFolder
+    from lumidock.app.run import Setup
+    from lumidock.app.run import run as run_source
+    from lumidock.streams.run_folder import RunFolder
 
     require_method(method)
     settings = load_config(config) if config else Config()
@@ -266,8 +266,8 @@ def _campaign(
     as_json: AsJson = False,
 ) -> None:
     """Run scenarios x seeds x methods on bare detections, and count."""
-    from lumidock.campaign import plan, prepare, run_campaign, tabulate
-    from lumidock.campaign_table import markdown
+    from lumidock.evaluation.campaign import plan, prepare, run_campaign, tabulate
+    from lumidock.evaluation.campaign_table import markdown
     from lumidock.sim.scenario import load_scenario
 
     for method in methods or ():
@@ -304,8 +304,8 @@ def _seeds(text: str) -> tuple[int, int]:
 @app.command("warm", epilog=example("lumidock warm"))
 def _warm() -> None:
     """Compile ahead, so that no run waits for it."""
+    from lumidock.app.warm import compile_ahead, warm_up
     from lumidock.localizer import Localizer
-    from lumidock.warm import compile_ahead, warm_up
 
     dock = load_station(shipped_or_path("station", DEFAULT_STATION))
     lens = load_camera(shipped_or_path("camera", DEFAULT_CAMERA))
@@ -323,17 +323,16 @@ def _demo(
     force: Force = False,
 ) -> None:
     """Simulate a docking, run it, and leave files and pictures."""
-    from lumidock import page
-    from lumidock.demo import Album, summary_lines
+    from lumidock.app.demo import Album, summary_lines
+    from lumidock.app.run import Setup
+    from lumidock.app.run import run as run_source
+    from lumidock.evaluation.metrics import evaluate, true_poses
     from lumidock.localizer import Localizer
-    from lumidock.metrics import evaluate, true_poses
-    from lumidock.report import report
+    from lumidock.report import page, report
     from lumidock.report.stills import contact_sheet, plot_trajectory
-    from lumidock.run import Setup
-    from lumidock.run import run as run_source
     from lumidock.sim.scenario import load_scenario
     from lumidock.sim.sequence import write_rendered
-    from lumidock.streams.runfolder import RunFolder
+    from lumidock.streams.run_folder import RunFolder
 
     prepare_folder(out, force)
     sequence, run_folder = out / "sequence", out / "run"

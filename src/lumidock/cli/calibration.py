@@ -30,7 +30,7 @@ def _import(
     force: Force = False,
 ) -> None:
     """Turn FILE into a camera_info file."""
-    from lumidock.calib import read_calibration, write_calibration
+    from lumidock.setup.calibration_files import read_calibration, write_calibration
 
     camera = read_calibration(source, name=name, size=_size(size))
     require_new(target, force)
@@ -46,7 +46,7 @@ def _export(
     force: Force = False,
 ) -> None:
     """Turn a camera_info file into another tool's."""
-    from lumidock.calib import write_calibration
+    from lumidock.setup.calibration_files import write_calibration
 
     camera = load_camera(shipped_or_path("camera", source))
     require_new(target, force)
@@ -73,7 +73,7 @@ def _check(
     as_json: AsJson = False,
 ) -> None:
     """Show the field of view, and warn of what looks wrong."""
-    from lumidock.calib import check, read_calibration
+    from lumidock.setup.calibration_files import check, read_calibration
 
     if (lens_mm is None) != (pixel_um is None):
         raise InputError("--lens-mm and --pixel-um belong together")

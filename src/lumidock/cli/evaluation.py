@@ -30,8 +30,8 @@ def _eval(
     as_json: AsJson = False,
 ) -> None:
     """Compare a run, or all in a folder, with the truth."""
-    from lumidock.metrics import evaluate
-    from lumidock.runs import evaluate_all, write_table
+    from lumidock.evaluation.metrics import evaluate
+    from lumidock.evaluation.run_folders import evaluate_all, write_table
 
     if out is not None:
         require_new(out, force)

@@ -19,7 +19,7 @@ from lumidock.cli.shared import (
     require_new,
 )
 from lumidock.streams.sources import open_source
-from lumidock.vehicle import load_vehicle
+from lumidock.streams.vehicle import load_vehicle
 
 
 @app.command(
@@ -43,7 +43,7 @@ def _export(
     force: Force = False,
 ) -> None:
     """Turn RUN into a file for ROS 2, Rerun, video players or tables."""
-    from lumidock.export import export
+    from lumidock.streams.export import export
 
     require_new(target, force)
     opened = open_source(source, fps, topic=topic) if source else None

@@ -47,8 +47,7 @@ def _report(
     force: Force = False,
 ) -> None:
     """Show how RUN went as one page that opens without network."""
-    from lumidock import page
-    from lumidock.report import report
+    from lumidock.report import page, report
 
     require_new(out, force)
     with progress_bar("report") as progress:

@@ -15,6 +15,8 @@ from typing import Annotated
 
 import typer
 
+from lumidock.app.serve import STALE_S, Camera, Newest, Server, Worker
+from lumidock.app.warm import warm_up
 from lumidock.camera import save_camera
 from lumidock.cli.shared import (
     SIM,
@@ -40,12 +42,10 @@ from lumidock.cli.shared import (
 from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
-from lumidock.serve import STALE_S, Camera, Newest, Server, Worker
-from lumidock.sinks import FILE_KINDS, Numbered, RunSink, Scene, open_rerun
 from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
-from lumidock.vehicle import load_vehicle
-from lumidock.warm import warm_up
+from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Scene, open_rerun
+from lumidock.streams.vehicle import load_vehicle
 
 _LOOPBACK, _ENDPOINT = "127.0.0.1", re.compile(r"(tcp|udp|tls|quic)/[^/?#]+:[0-9]{1,5}")
 _SWITCH_S = 5e-4  # a thread may hold the interpreter; the default lets the vehicle wait ten times longer

@@ -36,7 +36,8 @@ def _check(
     as_json: AsJson = False,
 ) -> None:
     """Say what can be seen and confused; exit code 1 when it falls short."""
-    from lumidock.stationcheck import Limits, draw_station, inspect_station
+    from lumidock.evaluation.station_check import Limits, inspect_station
+    from lumidock.report.station_picture import draw_station
 
     dock = load_station(shipped_or_path("station", source))
     lens = load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))

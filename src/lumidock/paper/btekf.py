@@ -140,8 +140,8 @@ class _Search:
         if self.nodes > self.config.max_nodes:
             return None
         light, rest = lights[0], lights[1:]
-        for spot, updated in self._candidates(track, light, used):
-            done = self.run(updated, rest, used | {spot}, missing)
+        for blob, updated in self._candidates(track, light, used):
+            done = self.run(updated, rest, used | {blob}, missing)
             if done is not None:
                 return done
         return self.run(track, rest, used, missing - 1) if missing else None
@@ -153,15 +153,15 @@ class _Search:
             return []
         d2 = gate.distance2(self.uv)
         accepted = []
-        for spot in np.argsort(d2, kind="stable"):
-            if d2[spot] > self.config.gate:
+        for blob in np.argsort(d2, kind="stable"):
+            if d2[blob] > self.config.gate:
                 break
-            if int(spot) in used:
+            if int(blob) in used:
                 continue
-            updated = gate.update(track, self.uv[spot])
-            residual = project_lights(self.camera, updated.T_dock_cam, self.p_dock[light][None])[0] - self.uv[spot]
+            updated = gate.update(track, self.uv[blob])
+            residual = project_lights(self.camera, updated.T_dock_cam, self.p_dock[light][None])[0] - self.uv[blob]
             if np.hypot(*residual) < self.config.accept_px:
-                accepted.append((int(spot), updated))
+                accepted.append((int(blob), updated))
         return accepted
 
 
@@ -179,9 +179,9 @@ def associate(projected: Array, uv: Array, max_px: float) -> Indices:
     distance[np.isnan(distance)] = np.inf
     light = np.full(len(uv), -1, np.int64)
     for flat in np.argsort(distance, axis=None, kind="stable"):
-        spot, candidate = np.unravel_index(flat, distance.shape)
-        if distance[spot, candidate] > max_px:
+        blob, candidate = np.unravel_index(flat, distance.shape)
+        if distance[blob, candidate] > max_px:
             break
-        if light[spot] < 0 and candidate not in light:
-            light[spot] = candidate
+        if light[blob] < 0 and candidate not in light:
+            light[blob] = candidate
     return light

@@ -21,7 +21,7 @@ _FRAME_PX = 2
 
 
 @dataclass(frozen=True, slots=True)
-class _Spot:
+class _Blob:
     """One light found: circle centre (u, v) px, equal-area radius px, grey levels summed above the background."""
 
     u: float
@@ -54,12 +54,12 @@ def lights(frame: Frame, config: ExtractConfig) -> Detections:
     gray = to_gray(frame.image, config.gray)
     background, threshold, binary, outlines = _separated(gray, config)
     regions = _connected_regions(gray, binary, outlines)
-    spots = [spot for region in regions for spot in _spots(region, threshold, background, config)]
-    spots = sorted((s for s in spots if _stands_out(s, gray, config)), key=lambda s: -s.flux)[: config.max_regions]
-    columns = np.array([[s.u, s.v, s.radius, s.flux] for s in spots]).reshape(-1, 4)
-    unknown = np.full(len(spots), np.nan)
+    blobs = [blob for region in regions for blob in _blobs(region, threshold, background, config)]
+    blobs = sorted((s for s in blobs if _stands_out(s, gray, config)), key=lambda s: -s.flux)[: config.max_regions]
+    columns = np.array([[s.u, s.v, s.radius, s.flux] for s in blobs]).reshape(-1, 4)
+    unknown = np.full(len(blobs), np.nan)
     uv, radius_px, flux = columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy()
-    return Detections(frame.name, frame.t_ns, uv, radius_px, flux, np.ones(len(spots)), unknown)
+    return Detections(frame.name, frame.t_ns, uv, radius_px, flux, np.ones(len(blobs)), unknown)
 
 
 def _separated(gray: Image, config: ExtractConfig) -> tuple[int, int, Image, list[Array]]:
@@ -153,7 +153,7 @@ def _components(gray: Image, binary: Image, offset: tuple[int, int], size: tuple
         yield _Region(gray[window], mask, (offset[0] + u, offset[1] + v), size)
 
 
-def _spots(region: _Region, threshold: int, background: int, config: ExtractConfig) -> Iterator[_Spot]:
+def _blobs(region: _Region, threshold: int, background: int, config: ExtractConfig) -> Iterator[_Blob]:
     """Lights in a region: cut at its own Otsu level until each part stands at half height, then opened and judged."""
     inside = region.gray[region.mask > 0]
     half = background + (int(inside.max()) - background) // 2
@@ -161,10 +161,10 @@ def _spots(region: _Region, threshold: int, background: int, config: ExtractConf
     if higher > threshold:
         _, binary = cv2.threshold(cv2.bitwise_and(region.gray, region.mask), higher, 255, cv2.THRESH_BINARY)
         for part in _components(region.gray, np.asarray(binary, np.uint8), region.offset, region.size):
-            yield from _spots(part, higher, background, config)
+            yield from _blobs(part, higher, background, config)
         return
     measured = (_measure(piece, background, config) for piece in _opened(region, config))
-    yield from (spot for spot in measured if spot is not None)
+    yield from (blob for blob in measured if blob is not None)
 
 
 def _next_level(inside: Image, threshold: int, half: int, config: ExtractConfig) -> int:
@@ -200,7 +200,7 @@ def _opened(region: _Region, config: ExtractConfig) -> Iterator[_Region]:
         yield from _components(region.gray, np.asarray(grown, np.uint8), region.offset, region.size)
 
 
-def _measure(piece: _Region, background: int, config: ExtractConfig) -> _Spot | None:
+def _measure(piece: _Region, background: int, config: ExtractConfig) -> _Blob | None:
     """Circle, roundness and compactness of a piece; None when it is no light."""
     contours, _ = cv2.findContours(piece.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outline = max(contours, key=len)[:, 0, :] + np.array(piece.offset, float)
@@ -218,7 +218,7 @@ def _measure(piece: _Region, background: int, config: ExtractConfig) -> _Spot | 
     if radius > config.max_radius_px or not (area < config.small_area_px or round_):
         return None
     equal_area = radius if piece.cut_by_edge else float(np.sqrt(area / np.pi))
-    return _Spot(float(center[0]), float(center[1]), equal_area, float(weights.sum()))
+    return _Blob(float(center[0]), float(center[1]), equal_area, float(weights.sum()))
 
 
 def _fit_arc(outline: Array, size: tuple[int, int], config: ExtractConfig) -> tuple[Array, float, bool]:
@@ -236,15 +236,15 @@ def _fit_arc(outline: Array, size: tuple[int, int], config: ExtractConfig) -> tu
     )
 
 
-def _stands_out(spot: _Spot, gray: Image, config: ExtractConfig) -> bool:
+def _stands_out(blob: _Blob, gray: Image, config: ExtractConfig) -> bool:
     """Whether a small spot's peak clears the noise of the ring around it; large ones were judged by their shape."""
-    if np.pi * spot.radius**2 >= config.small_area_px:
+    if np.pi * blob.radius**2 >= config.small_area_px:
         return True
-    u, v, reach = round(spot.u), round(spot.v), int(1.5 * spot.radius) + 4
+    u, v, reach = round(blob.u), round(blob.v), int(1.5 * blob.radius) + 4
     window = gray[max(v - reach, 0) : v + reach + 1, max(u - reach, 0) : u + reach + 1].astype(float)
     rows, columns = np.indices(window.shape)
-    distance = np.hypot(columns + max(u - reach, 0) - spot.u, rows + max(v - reach, 0) - spot.v)
-    core, ring = window[distance <= max(spot.radius, 1.0)], window[distance > spot.radius + 2.0]
+    distance = np.hypot(columns + max(u - reach, 0) - blob.u, rows + max(v - reach, 0) - blob.v)
+    core, ring = window[distance <= max(blob.radius, 1.0)], window[distance > blob.radius + 2.0]
     noise = max(float(np.subtract(*np.percentile(ring, [75, 25]))) / 1.35, 1.0)
     return float(core.max() - np.median(ring)) > config.contrast * noise
 

@@ -62,7 +62,7 @@ class PaperLocalizer:
         last, self._last_t_ns = self._last_t_ns, detections.t_ns
         if last is not None and detections.t_ns <= last:
             return self._no_fix(detections, "bad_stamp")
-        if len(detections) > self.config.max_spots:
+        if len(detections) > self.config.max_detections:
             return self._no_fix(detections, "too_many")
         light, answers = self._locate(detections)
         poses = {answer.pose.layer: answer.pose for answer in answers if answer.pose is not None}
@@ -85,9 +85,9 @@ class PaperLocalizer:
         """Light of each spot (N,) and what each layer answered."""
         light = np.full(len(detections), -1, np.int64)
         answers = []
-        for layer, spots in zip(self._layers, self._split(detections), strict=True):
-            answer = layer.locate(detections.t_ns, detections.uv[spots])
-            light[spots] = answer.light
+        for layer, blobs in zip(self._layers, self._split(detections), strict=True):
+            answer = layer.locate(detections.t_ns, detections.uv[blobs])
+            light[blobs] = answer.light
             answers.append(answer)
         return light, answers
 

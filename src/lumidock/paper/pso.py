@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lumidock._kernels.swarm import assign, registration_cost, swarm
 from lumidock.config import PsoConfig
 from lumidock.datatypes import Array, Indices
 from lumidock.paper.normalize import normalize
+from lumidock.paper.swarm import assign, registration_cost, swarm
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from lumidock import page
 from lumidock.errors import InputError
-from lumidock.page import Section
-from lumidock.report import figures, tables
+from lumidock.evaluation.run_folders import find_runs
+from lumidock.report import figures, page, tables
 from lumidock.report.moments import pictures
+from lumidock.report.page import Section
 from lumidock.report.view import RunView, load_run
-from lumidock.runs import find_runs
 
 _MOST_RUNS, _MOST_IN_FULL = 12, 3
 _POINTS_IN_BRIEF = 150

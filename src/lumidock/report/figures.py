@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lumidock.datatypes import Array
-from lumidock.page import Plot
-from lumidock.plots import COLORS, plot
+from lumidock.report.page import Plot
+from lumidock.report.plots import COLORS, plot
 from lumidock.report.view import KINDS, STAGES, RunView
 
 if TYPE_CHECKING:

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 
 from lumidock.datatypes import Array, Detections, Fix, Frame, Image, Match
-from lumidock.overlay import View, around_lights, whole
-from lumidock.page import Mark, Picture
 from lumidock.picture import developed
 from lumidock.pose import project_lights
+from lumidock.report.page import Mark, Picture
 from lumidock.report.view import RunView
 from lumidock.station import Station
+from lumidock.streams.overlay import View, around_lights, whole
 from lumidock.streams.sources import Item
 
 _WIDTH, _QUALITY = 760, 82
@@ -134,8 +134,8 @@ def _part(image: Image, fix: Fix) -> View:
     if fix.match is None or not (fix.match.light >= 0).any():
         return whole(image, _WIDTH)
     named = fix.match.light >= 0
-    spots = Detections.from_uv(fix.frame, fix.t_ns, fix.match.detections.uv[named])
-    return around_lights(image, replace(fix, match=Match(spots, fix.match.light[named])), _WIDTH)
+    detections = Detections.from_uv(fix.frame, fix.t_ns, fix.match.detections.uv[named])
+    return around_lights(image, replace(fix, match=Match(detections, fix.match.light[named])), _WIDTH)
 
 
 def _predicted(view: RunView, fix: Fix) -> Array:
@@ -160,9 +160,11 @@ def _crosses(station: Station, predicted: Array, part: View) -> Iterator[Mark]:
 def _rings(fix: Fix, station: Station, part: View, rejected: dict[int, str]) -> Iterator[Mark]:
     if fix.match is None:
         return
-    number = {spot: str(n) for n, spot in enumerate(rejected, start=1)}
-    spots = fix.match.detections
-    for k, (uv, radius, light) in enumerate(zip(spots.uv, spots.radius_px, fix.match.light.tolist(), strict=True)):
+    number = {detection: str(n) for n, detection in enumerate(rejected, start=1)}
+    detections = fix.match.detections
+    for k, (uv, radius, light) in enumerate(
+        zip(detections.uv, detections.radius_px, fix.match.light.tolist(), strict=True)
+    ):
         ring = max(8.0, round(1.6 * float(np.nan_to_num(radius)) * part.scale, 1) + 4.0)
         x, y = map(float, part.at(uv))
         name, color = (station.ids[light], _color(station, light)) if light >= 0 else (number[k], _REJECTED)
@@ -173,10 +175,10 @@ def _rejections(fix: Fix, station: Station, predicted: Array) -> dict[int, str]:
     """Why each detection without a name has none, by its number; told from what the run's files say."""
     if fix.match is None:
         return {}
-    spots, light = fix.match.detections, fix.match.light
+    detections, light = fix.match.detections, fix.match.light
     named = {station.ids[i] for i in light.tolist() if i >= 0}
     return {
-        int(k): _why(spots.uv[k], float(spots.p_light[k]), fix, station, predicted, named)
+        int(k): _why(detections.uv[k], float(detections.p_light[k]), fix, station, predicted, named)
         for k in np.flatnonzero(light < 0)
     }
 

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from lumidock.config import Config
-from lumidock.page import Listing, Table, Tile
+from lumidock.report.page import Listing, Table, Tile
 from lumidock.report.view import STAGES, RunView
 
 _WHY = {

@@ -8,15 +8,15 @@ from typing import Any, get_args
 
 import numpy as np
 
-from lumidock import runs, trust
 from lumidock.camera import Camera, load_camera
 from lumidock.datatypes import Array, Fix, Stage
 from lumidock.errors import InputError
-from lumidock.metrics import evaluate, read_rows, true_poses
+from lumidock.evaluation import run_folders
+from lumidock.evaluation.claims import GuideClaims, PoseClaims, pose_error, true_guide
+from lumidock.evaluation.metrics import evaluate, read_rows, true_poses
 from lumidock.station import Station, load_station
 from lumidock.streams.replay import read_fixes
 from lumidock.streams.sources import Source
-from lumidock.trust import GuideClaims, PoseClaims
 
 KINDS = ("lateral", "axial", "angle")
 STAGES: tuple[Stage, ...] = get_args(Stage)
@@ -75,13 +75,13 @@ def load_run(folder: Path, source: Path | None = None) -> RunView:
 
     Raises: InputError, one line, for a folder that is no run, or a source that it was not made from.
     """
-    description = runs.described(folder)
+    description = run_folders.described(folder)
     station, camera = load_station(folder / "station.yaml"), load_camera(folder / "camera.yaml")
     rows = list(read_fixes(folder, station.ids))
     if not rows:
         raise InputError(f"{folder}: a run without frames")
     fixes = [fix for fix, _, _ in rows]
-    opened = runs.source_of(folder, description, source)
+    opened = run_folders.source_of(folder, description, source)
     truth = _truth_of(opened)
     start = next((t for _, t, _ in rows if t is not None), 0)
     guide, guide_levels, guide_limits, guide_errors = _guide_columns(fixes, truth)
@@ -136,7 +136,7 @@ def _guide_columns(fixes: list[Fix], truth: dict[str, Array]) -> tuple[Array, Ar
             guide[k] = fix.guide.bearing_x_rad, fix.guide.bearing_y_rad, fix.guide.range_m
             levels[k] = fix.guide.pl_bearing_rad, fix.guide.pl_range_m
         if fix.frame in truth:
-            true[k] = trust.true_guide(truth[fix.frame])
+            true[k] = true_guide(truth[fix.frame])
     claims = GuideClaims(guide, true, levels)
     known = np.isfinite(guide[:, 2:])
     return guide, levels, np.where(known, claims.limits(), np.nan), np.where(known, claims.sizes(), np.nan)
@@ -153,7 +153,7 @@ def _pose_errors(fixes: list[Fix], truth: dict[str, Array]) -> Array:
     errors = np.full((n, 6), np.nan)
     for k, fix in enumerate(fixes):
         if fix.T_dock_cam is not None and fix.frame in truth:
-            errors[k] = trust.pose_error(fix.T_dock_cam, truth[fix.frame])
+            errors[k] = pose_error(fix.T_dock_cam, truth[fix.frame])
     unknown = np.full((n, 3), np.nan)
     return PoseClaims(unknown[:, 0], errors, unknown, np.full((n, 6, 6), np.nan), [""] * n).sizes()
 

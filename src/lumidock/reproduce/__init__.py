@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lumidock import page
-from lumidock.campaign import read_json, write_whole
 from lumidock.errors import InputError
-from lumidock.page import Section, Table
+from lumidock.evaluation.campaign import read_json, write_whole
+from lumidock.report import page
+from lumidock.report.page import Section, Table
+from lumidock.reproduce.experiments import jobs_of
 from lumidock.reproduce.grid import FULL, QUICK, Grid
 from lumidock.reproduce.jobs import Progress, run_jobs
-from lumidock.reproduce.plan import jobs_of
 from lumidock.reproduce.sections import sections_of
 
 __all__ = ["FULL", "QUICK", "Grid", "reproduce"]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lumidock.page import Table
+from lumidock.report.page import Table
 from lumidock.sim.measured import measured_table
 
 _HEAD = ["pictures of", "frames", "lights", "missed, %", "error over sigma", "wrong layer, %", "false spots a frame"]
@@ -28,9 +28,17 @@ def detector_table() -> Table:
 def _cells(cells: dict[str, Any], bands: int) -> list[str]:
     lights = [(kind, cell) for kind in ("front", "rear") for cell in cells[kind][:bands]]
     of, seen = (sum(cell[key] for _, cell in lights) for key in ("of", "seen"))
-    spots = [(cell["seen"] / len(cell["spots"]), kind, spot) for kind, cell in lights for spot in cell["spots"]]
+    detections = [
+        (cell["seen"] / len(cell["detections"]), kind, detection)
+        for kind, cell in lights
+        for detection in cell["detections"]
+    ]
     square = sum(cell["seen"] * cell["mean_square"] for _, cell in lights) / max(seen, 1)
-    known = [(weight, (spot[3] > 0.5) != (kind == "rear")) for weight, kind, spot in spots if spot[3] is not None]
+    known = [
+        (weight, (detection[3] > 0.5) != (kind == "rear"))
+        for weight, kind, detection in detections
+        if detection[3] is not None
+    ]
     wrong = sum(weight * bad for weight, bad in known) / max(sum(weight for weight, _ in known), 1e-9)
     frames, false = (sum(cell[key] for cell in cells["false"]) for key in ("of", "seen"))
     missed = f"{100.0 * (1.0 - seen / max(of, 1)):.1f}"

@@ -14,8 +14,8 @@ from typing import Any
 
 import cv2
 
-from lumidock.campaign import read_json, source_digest, worker_pool, write_whole
 from lumidock.errors import LumidockError
+from lumidock.evaluation.campaign import read_json, source_digest, worker_pool, write_whole
 
 Progress = Callable[[int, int | None], None]
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lumidock.page import Plot
-from lumidock.plots import COLORS, plot
+from lumidock.report.page import Plot
+from lumidock.report.plots import COLORS, plot
 from lumidock.report.view import RunView
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def swarm(result: dict[str, Any]) -> Plot:
     """Figure 6: the best particle over the iterations."""
     caption = (
-        f"The swarm converging (the paper's figure 6) on {result['spots']} of the front lights from z = "
+        f"The swarm converging (the paper's figure 6) on {result['detections']} of the front lights from z = "
         f"{result['z_m']:.1f} m: roll in degrees, scale and shift of the best particle, and how many names are right, "
         "over its iterations."
     )
@@ -59,11 +59,11 @@ def _draw_backtracking(figure: Figure, narrow: bool, result: dict[str, Any]) -> 
     panels = figure.subplots(*((2, 1) if narrow else (1, 2)))
     for axes, who, title in zip(panels, ("swarm", "filter"), ("swarm alone", "backtracking filter"), strict=True):
         axes.scatter(*expected.T, marker="x", s=36, color=COLORS["dim"], lw=1.2)
-        for spot, maker, light in zip(uv, true, result[who] or [-1] * len(uv), strict=True):
+        for detection, maker, light in zip(uv, true, result[who] or [-1] * len(uv), strict=True):
             color = COLORS["bad" if maker < 0 else "transition" if maker == light else "front"]
-            axes.scatter(*spot, s=52, facecolors="none", edgecolors=color, lw=1.6)
+            axes.scatter(*detection, s=52, facecolors="none", edgecolors=color, lw=1.6)
             name = result["ids"][light] if light >= 0 else "none"
-            axes.annotate(name, spot, xytext=(7, 4), textcoords="offset points", color=color)
+            axes.annotate(name, detection, xytext=(7, 4), textcoords="offset points", color=color)
         axes.set(title=title, aspect="equal", xlabel="u, px", ylabel="v, px")
         axes.margins(0.15)
         axes.invert_yaxis()

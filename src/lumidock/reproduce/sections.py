@@ -6,14 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lumidock.page import Section, Table, Tile, markdown
 from lumidock.report import figures
 from lumidock.report.moments import pictures
+from lumidock.report.page import Section, Table, Tile, markdown
 from lumidock.report.view import load_run
 from lumidock.reproduce import plots
 from lumidock.reproduce.detector import detector_table
+from lumidock.reproduce.experiments import COLD, FAULTS_AT_DISTANCE, ROWS
 from lumidock.reproduce.grid import Grid
-from lumidock.reproduce.paper import (
+from lumidock.reproduce.paper_figures import (
     AXIS_M,
     DISTANCES_M,
     DOCKING_PLANE_Z_M,
@@ -25,7 +26,6 @@ from lumidock.reproduce.paper import (
     SINGLE_LAYER_MS,
     TABLE_1,
 )
-from lumidock.reproduce.plan import COLD, FAULTS_AT_DISTANCE, ROWS
 from lumidock.reproduce.trials import Counts
 from lumidock.reproduce.work import search_sides
 

@@ -17,8 +17,8 @@ from lumidock.localizer import Localizer
 from lumidock.paper import PaperLocalizer
 from lumidock.paper.consistency import consistent
 from lumidock.paper.layer import LayerLocalizer
+from lumidock.sim.detections import SimulatedFrame, simulated_frames
 from lumidock.sim.scenario import Scenario, load_scenario
-from lumidock.sim.spots import SpotFrame, spot_frames
 from lumidock.station import Station
 
 CLEAN_FRAMES = 4  # before the faults begin, in the rows with history
@@ -58,7 +58,7 @@ class _Methods:
 
 def trials_scenario(missing: int, spurious: int) -> Scenario:
     """Section 4.1 with the rear layer out of sight."""
-    settings = (f"faults.missing={missing}", f"faults.spurious={spurious}", "spots.rear_range_m=0.01")
+    settings = (f"faults.missing={missing}", f"faults.spurious={spurious}", "detections.rear_range_m=0.01")
     return load_scenario("trials", settings)
 
 
@@ -78,8 +78,8 @@ def trial(
         Localizer(station, camera),
     )
     counts = Counts()
-    clean = spot_frames(trials_scenario(0, 0), station, camera, seed)
-    faulty = spot_frames(trials_scenario(missing, spurious), station, camera, seed)
+    clean = simulated_frames(trials_scenario(0, 0), station, camera, seed)
+    faulty = simulated_frames(trials_scenario(missing, spurious), station, camera, seed)
     in_view = [pair for pair in zip(clean, faulty, strict=True) if pair[1].in_view[front].all()]
     warming = CLEAN_FRAMES if clean_start else 0
     for before, _ in in_view[:warming]:
@@ -90,7 +90,7 @@ def trial(
     return counts
 
 
-def _count(counts: Counts, frame: SpotFrame, methods: _Methods) -> None:
+def _count(counts: Counts, frame: SimulatedFrame, methods: _Methods) -> None:
     counts.frames += 1
     _count_swarm(counts, frame, methods.swarm)
     right, wrong = verdict(methods.paper.process_detections(frame.detections), frame)
@@ -101,7 +101,7 @@ def _count(counts: Counts, frame: SpotFrame, methods: _Methods) -> None:
     counts.ours_right, counts.ours_wrong = counts.ours_right + right, counts.ours_wrong + wrong
 
 
-def _count_swarm(counts: Counts, frame: SpotFrame, swarm: LayerLocalizer) -> None:
+def _count_swarm(counts: Counts, frame: SimulatedFrame, swarm: LayerLocalizer) -> None:
     registration = swarm.register(frame.detections.uv)
     assert registration is not None
     right = np.array_equal(registration.light, frame.light)
@@ -112,7 +112,7 @@ def _count_swarm(counts: Counts, frame: SpotFrame, swarm: LayerLocalizer) -> Non
     counts.filter_passes_wrong += passes and not right
 
 
-def verdict(fix: Fix, frame: SpotFrame) -> tuple[bool, bool]:
+def verdict(fix: Fix, frame: SimulatedFrame) -> tuple[bool, bool]:
     """Whether all names of an answer are right, and whether one of them is wrong; neither without an answer."""
     if fix.match is None or fix.status == "none":
         return False, False

@@ -11,30 +11,30 @@ from typing import Any
 
 import numpy as np
 
+from lumidock.app.run import Setup, run
 from lumidock.camera import Camera, load_camera
-from lumidock.campaign import plan, run_shard
-from lumidock.campaign_table import row_of
 from lumidock.config import Config, PaperConfig
 from lumidock.datatypes import Array, Fix, Frame, Unusable
 from lumidock.errors import FrameError
+from lumidock.evaluation.campaign import plan, run_shard
+from lumidock.evaluation.campaign_table import row_of
+from lumidock.evaluation.counts import Tally
+from lumidock.evaluation.metrics import evaluate, true_poses
 from lumidock.localizer import Localizer
-from lumidock.methods import METHODS, TwoDoors, localizer_of
-from lumidock.metrics import evaluate, true_poses
+from lumidock.methods import METHODS, Method, localizer_of
 from lumidock.paper import PaperLocalizer, btekf
 from lumidock.paper.layer import LayerLocalizer
 from lumidock.pose import project_lights
 from lumidock.reproduce.trials import Counts, trial, trials_scenario, verdict
-from lumidock.run import Setup, run
+from lumidock.sim.detections import SimulatedFrame, simulated_frames
 from lumidock.sim.scenario import Scenario, load_scenario, spurious_paths, trajectory
 from lumidock.sim.sequence import file_of, render_frame, rendered
-from lumidock.sim.spots import SpotFrame, spot_frames
 from lumidock.sim.stream import Row
 from lumidock.station import Station, load_station
 from lumidock.streams.images import decode_image
 from lumidock.streams.replay import read_fixes
-from lumidock.streams.runfolder import RunFolder
+from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.sources import Source
-from lumidock.tally import Tally
 
 _FOUR = 4  # named lights of a layer that give a pose by it alone
 Dock = tuple[str, str]  # station and camera file
@@ -55,11 +55,11 @@ def table_1(dock: Dock, missing: int, spurious: int, first: int, stop: int, clea
     return asdict(sum(trials, Counts()))
 
 
-def cold_start(dock: Dock, scenario: str, settings: list[str], seed: int) -> dict[str, Any]:
+def acquisition_trial(dock: Dock, scenario: str, settings: list[str], seed: int) -> dict[str, Any]:
     """Independent frames without history by both methods: answers, right ones and those with a wrong name."""
     station, camera = _load(dock)
     loaded = load_scenario(scenario, tuple(settings))
-    frames = list(spot_frames(loaded, station, camera, seed))
+    frames = list(simulated_frames(loaded, station, camera, seed))
     result: dict[str, Any] = {"frames": len(frames)}
     for method in METHODS:
         localizer = localizer_of(method, station, camera, Config(), cold=True)
@@ -128,7 +128,7 @@ def _items(pictures: Pictures) -> Iterator[Frame | Unusable]:
             yield Unusable(row.name, row.t_ns, error.reason, str(error))
 
 
-def _warm(localizer: TwoDoors, pictures: Pictures) -> None:
+def _warm(localizer: Method, pictures: Pictures) -> None:
     """Compile before times are taken: the first frames of a machine take seconds more."""
     for item in _items(pictures[:: max(1, len(pictures) // 6)]):
         with suppress(FrameError):
@@ -195,11 +195,11 @@ def _used(rows: list[tuple[float, bool, bool]]) -> dict[str, Any]:
 def _rendered(scenario: Scenario, station: Station, camera: Camera, seed: int) -> Iterator[tuple[float, Frame]]:
     """True z and picture of each frame of a scenario."""
     t_ns, poses = trajectory(scenario, np.random.default_rng([seed, 0]))
-    strays = spurious_paths(scenario, t_ns, (camera.width, camera.height), np.random.default_rng([seed, 2]))
+    spurious = spurious_paths(scenario, t_ns, (camera.width, camera.height), np.random.default_rng([seed, 2]))
     for number, (t, T_dock_cam) in enumerate(zip(t_ns.tolist(), poses, strict=True)):
         rng = np.random.default_rng([seed, 3, number])
         nothing = np.empty(0, np.int64)
-        image, _, _ = render_frame(scenario, station, camera, T_dock_cam, strays[number], nothing, rng)
+        image, _, _ = render_frame(scenario, station, camera, T_dock_cam, spurious[number], nothing, rng)
         yield float(T_dock_cam[2, 3]), Frame(f"{number:06d}", t, image)
 
 
@@ -226,7 +226,7 @@ def swarm(dock: Dock, seed: int, iterations: list[int]) -> dict[str, Any]:
     """Figure 6: the same swarm stopped after more and more iterations, on one frame with a light missing."""
     station, camera = _load(dock)
     layer = station.layers_front_to_rear()[0]
-    frames = [f for f in spot_frames(trials_scenario(1, 0), station, camera, seed) if f.T_dock_cam[2, 3] < 9.0]
+    frames = [f for f in simulated_frames(trials_scenario(1, 0), station, camera, seed) if f.T_dock_cam[2, 3] < 9.0]
     frame, config = frames[0], PaperConfig()
     rows = []
     for count in iterations:
@@ -236,7 +236,7 @@ def swarm(dock: Dock, seed: int, iterations: list[int]) -> dict[str, Any]:
         assert found is not None
         right = int((found.light == frame.light).sum())
         rows.append([count, *map(float, found.transform), found.fitness, right])
-    return {"z_m": float(frame.T_dock_cam[2, 3]), "spots": len(frame.light), "rows": rows}
+    return {"z_m": float(frame.T_dock_cam[2, 3]), "detections": len(frame.light), "rows": rows}
 
 
 def backtracking(dock: Dock, seed: int) -> dict[str, Any]:
@@ -246,7 +246,9 @@ def backtracking(dock: Dock, seed: int) -> dict[str, Any]:
     """
     station, camera = _load(dock)
     layer = station.layers_front_to_rear()[0]
-    runs = [list(spot_frames(trials_scenario(*faults), station, camera, seed)) for faults in ((0, 0), (0, 1), (1, 1))]
+    runs = [
+        list(simulated_frames(trials_scenario(*faults), station, camera, seed)) for faults in ((0, 0), (0, 1), (1, 1))
+    ]
     near = [
         k
         for k, frame in enumerate(runs[0])
@@ -268,7 +270,7 @@ def backtracking(dock: Dock, seed: int) -> dict[str, Any]:
     return {"rows": rows} | _last_frame(order[-1], filtered, station, camera)
 
 
-def _last_frame(frame: SpotFrame, filtered: LayerLocalizer, station: Station, camera: Camera) -> dict[str, Any]:
+def _last_frame(frame: SimulatedFrame, filtered: LayerLocalizer, station: Station, camera: Camera) -> dict[str, Any]:
     """The spots of a frame, where the filter's track expects the lights, and the names by the swarm and the filter."""
     d = frame.detections
     alone = LayerLocalizer(station, filtered.layer, camera, filtered.config).register(d.uv)

@@ -6,11 +6,11 @@ import numpy as np
 
 from lumidock.datatypes import Array
 from lumidock.sim.canvas import Canvas
+from lumidock.sim.detections import emission_cosine
 from lumidock.sim.knobs import Glints, Headlamp, Snow, Surface, Vehicle
 from lumidock.sim.optics import PHOTON_J, SPECTRUM, Emitters, View, emitters, intensity
 from lumidock.sim.scattering import backscatter_share, phase_at
 from lumidock.sim.scenario import Scenario
-from lumidock.sim.spots import emission_cosine
 from lumidock.sim.water import absorption_scattering, diffuse_attenuation, phase_kind
 from lumidock.station import Station
 

@@ -52,10 +52,10 @@ def course_of(scenario: Scenario, station: Station, camera: Camera, rng: np.rand
 def _draws(scenario: Scenario, station: Station, camera: Camera, rng: np.random.Generator) -> tuple[Array, Array]:
     """Poses (count, hold, 4, 4) with all front lights in view, and the water's surface (count,) above the dock."""
     path = scenario.path
-    z_m, surface_m = rng.uniform(*path.z_m, path.count), rng.uniform(*scenario.spots.surface_m, path.count)
+    z_m, surface_m = rng.uniform(*path.z_m, path.count), rng.uniform(*scenario.detections.surface_m, path.count)
     T_dock_cam, todo = np.empty((path.count, path.hold, 4, 4)), np.arange(path.count)
     for _ in range(_MAX_ROUNDS):
-        if scenario.spots.mirror == "only":
+        if scenario.detections.mirror == "only":
             drawn = _looking_up(path, z_m[todo], surface_m[todo], rng)
         else:
             drawn = _looking_around(path, camera, z_m[todo], rng)
@@ -113,7 +113,7 @@ def _front_in_view(scenario: Scenario, station: Station, camera: Camera, held: A
     n, k = held.shape[:2]
     front = station.lights_of(station.layers_front_to_rear()[0])
     p_dock, T_dock_cam = np.broadcast_to(station.p_dock[front], (n * k, len(front), 3)), held.reshape(-1, 4, 4)
-    if scenario.spots.mirror == "only":
+    if scenario.detections.mirror == "only":
         p_dock = mirror_image(p_dock, np.repeat(surface_m, k))
     uv, p_cam = project_each(camera, T_dock_cam, p_dock)
     shining = shines(station.axis[front], scenario, T_dock_cam, p_dock)
@@ -136,6 +136,6 @@ def project_each(camera: Camera, T_dock_cam: Array, p_dock: Array) -> tuple[Arra
 
 def shines(axis: Array, scenario: Scenario, T_dock_cam: Array, p_dock: Array) -> np.ndarray:
     """Which lights (N, M), or mirror images of them, send light toward the camera; `axis` (M, 3)."""
-    if scenario.spots.mirror == "only":
+    if scenario.detections.mirror == "only":
         axis = axis * [1.0, -1.0, 1.0]
     return np.asarray(((T_dock_cam[:, None, :3, 3] - p_dock) * axis).sum(axis=2) > 0.0)

@@ -41,7 +41,7 @@ class Moment:
     p_dock: Array
     transmission: Array
     dark: Indices
-    strays: Array
+    spurious: Array
     surface: Surface | None
     dock: bool = True
     draws: tuple[int, ...] = (0,)
@@ -114,8 +114,8 @@ class Studio:
             parts.append(around.vehicle(knobs.vehicle, view, radius_m))
         if knobs.snow is not None:
             parts.append(around.snow(knobs.snow, scenario, view, moment.rng(13)))
-        if len(moment.strays):
-            parts.append(_strays(own, moment.strays))
+        if len(moment.spurious):
+            parts.append(_spurious(own, moment.spurious))
         return joined(parts)
 
     def _smear(self, moment: Moment, seen: Emitters) -> Array:
@@ -166,7 +166,7 @@ class Studio:
                 core.own[...] *= clear[core.rows, core.columns]
 
 
-def _strays(own: Emitters, uv: Array) -> Emitters:
+def _spurious(own: Emitters, uv: Array) -> Emitters:
     """Emitters at pixels `uv` (S, 2), each as bright as the brightest of the station's lamps."""
     like = np.full(len(uv), int(np.argmax(own.at_lens.sum(axis=1) * np.isfinite(own.uv).all(axis=1))))
     some = Emitters(*(getattr(own, name)[like] for name in Emitters.__slots__))

@@ -24,7 +24,7 @@ _PICTURE = {"water", "daylight", "lamps", "around", "lens", "sensor", "output"} 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SpotTable:
+class DetectionTable:
     """S spots, those of one frame in a row.
 
     The `frame` of each (S,), true pixels `uv` (S, 2), its `light` (S,), -1 for none, and how far away that is,
@@ -38,7 +38,7 @@ class SpotTable:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looks:
+class Appearance:
     """What the detector says of S spots: errors `off_px` (S, 2), `cov_px2` (S, 2, 2), `p_light` and `p_rear` (S,)."""
 
     off_px: Array
@@ -56,7 +56,7 @@ class Cell:
     """
 
     rate: float
-    spots: Array
+    detections: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +85,7 @@ class DetectorErrors:
         for k, cell in enumerate(self.cells[kind]):
             here = np.flatnonzero(band == k)
             if len(here):
-                drawn[here] = cell.spots[rng.integers(len(cell.spots), size=len(here))]
+                drawn[here] = cell.detections[rng.integers(len(cell.detections), size=len(here))]
         return drawn
 
 
@@ -101,14 +101,14 @@ def detector_errors(name: str) -> DetectorErrors:
     """What was measured on frames of the shipped scenario `name`. Raises: InputError when it was not."""
     table = measured_table()
     if name not in table["scenarios"]:
-        raise InputError(f"spots.detector: {name} is not measured; there are {', '.join(table['scenarios'])}")
+        raise InputError(f"detections.detector: {name} is not measured; there are {', '.join(table['scenarios'])}")
     cells = {kind: tuple(map(_cell, table["scenarios"][name][kind])) for kind in KINDS}
     return DetectorErrors(np.array(table["edges_m"]), cells)
 
 
 def _cell(content: dict[str, Any]) -> Cell:
     """Where nothing was found nothing will be."""
-    return Cell(content["seen"] / max(content["of"], 1), np.array(content["spots"], float).reshape(-1, 4))
+    return Cell(content["seen"] / max(content["of"], 1), np.array(content["detections"], float).reshape(-1, 4))
 
 
 def measured_like(scenario: Scenario) -> str:
@@ -125,8 +125,8 @@ def same_picture(one: Scenario, other: Scenario) -> bool:
 
 
 def with_false(
-    spots: SpotTable, errors: DetectorErrors, dock_m: Array, camera: Camera, rng: np.random.Generator
-) -> SpotTable:
+    detections: DetectionTable, errors: DetectorErrors, dock_m: Array, camera: Camera, rng: np.random.Generator
+) -> DetectionTable:
     """The same and false spots, anywhere in the picture and new in each frame.
 
     `dock_m` (N,) is how far the dock is from the camera in each frame, NaN in black ones, which have none.
@@ -134,32 +134,32 @@ def with_false(
     rate = np.where(np.isnan(dock_m), 0.0, errors.rate("false", dock_m))
     false = np.repeat(np.arange(len(rate)), rng.poisson(rate))
     uv = rng.random((len(false), 2)) * [camera.width, camera.height] - 0.5
-    frame = np.concatenate([spots.frame, false])
+    frame = np.concatenate([detections.frame, false])
     order = np.argsort(frame, kind="stable")
-    light = np.concatenate([spots.light, np.full(len(false), -1)])
-    range_m = np.concatenate([spots.range_m, dock_m[false]])
-    return SpotTable(frame[order], np.concatenate([spots.uv, uv])[order], light[order], range_m[order])
+    light = np.concatenate([detections.light, np.full(len(false), -1)])
+    range_m = np.concatenate([detections.range_m, dock_m[false]])
+    return DetectionTable(frame[order], np.concatenate([detections.uv, uv])[order], light[order], range_m[order])
 
 
 def as_measured(
     errors: DetectorErrors,
-    looks: Looks,
-    spots: SpotTable,
+    appearance: Appearance,
+    detections: DetectionTable,
     rear: np.ndarray,
     noise_px: float,
     rng: np.random.Generator,
-) -> Looks:
+) -> Appearance:
     """Like `looks`, but lights, of which some are `rear` (M,), and false spots as measured.
 
     Spurious lights keep what the scenario says of them, with `noise_px` as their sigma.
     """
-    n, light, stray = len(spots.light), spots.light >= 0, np.isnan(spots.range_m)
-    drawn = np.stack([np.full(n, noise_px), np.zeros(n), looks.p_light, looks.p_rear], axis=1)
-    of_rear = light & rear[spots.light]
+    n, light, stray = len(detections.light), detections.light >= 0, np.isnan(detections.range_m)
+    drawn = np.stack([np.full(n, noise_px), np.zeros(n), appearance.p_light, appearance.p_rear], axis=1)
+    of_rear = light & rear[detections.light]
     for kind, which in (("front", light & ~of_rear), ("rear", of_rear), ("false", ~light & ~stray)):
-        drawn[which] = errors.draw(kind, spots.range_m[which], rng)
+        drawn[which] = errors.draw(kind, detections.range_m[which], rng)
     sigma_px, over, p_light, p_rear = drawn.T
     way = rng.uniform(0.0, 2.0 * np.pi, n)
     off_px = (sigma_px * over)[:, None] * np.stack([np.cos(way), np.sin(way)], axis=1)
-    off_px[stray] = looks.off_px[stray]
-    return Looks(off_px, sigma_px[:, None, None] ** 2 * np.eye(2), p_light, p_rear)
+    off_px[stray] = appearance.off_px[stray]
+    return Appearance(off_px, sigma_px[:, None, None] ** 2 * np.eye(2), p_light, p_rear)

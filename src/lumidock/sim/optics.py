@@ -8,9 +8,9 @@ import numpy as np
 
 from lumidock.datatypes import Array
 from lumidock.geometry import se3_inverse, transform_points
+from lumidock.sim.detections import emission_cosine, shown_layers
 from lumidock.sim.lens import Lens
 from lumidock.sim.scenario import Scenario
-from lumidock.sim.spots import emission_cosine, shown_layers
 from lumidock.sim.water import BAND_NM
 from lumidock.station import Station
 

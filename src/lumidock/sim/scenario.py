@@ -116,7 +116,7 @@ class BlackOuts(Section):
     length_s: Lengths = (0.2, 2.0)  # ... and how long each is
 
 
-class Spots(Section):
+class DetectionKnobs(Section):
     """Bare detections, made without rendering. What is drawn for a run is drawn for each draw of a path of draws."""
 
     # a shipped scenario, on whose frames it was measured how the detector finds lights, errs in their centres and
@@ -156,21 +156,21 @@ class Scenario(Section):
     output: Output = Output()
     stream: Stream = Stream()
     faults: Faults = Faults()
-    spots: Spots = Spots()
+    detections: DetectionKnobs = DetectionKnobs()
     config: dict[str, Any] = Field(
         default_factory=dict
     )  # settings of the method that the scenario needs, as in a configuration file
 
     @model_validator(mode="after")
     def _mirrored_camera_can_be_turned(self) -> Self:
-        if self.spots.mirror == "only" and self.path.kind != "draws":
-            raise ValueError("spots.mirror: wanted a path of draws, whose camera looks up at the surface")
+        if self.detections.mirror == "only" and self.path.kind != "draws":
+            raise ValueError("detections.mirror: wanted a path of draws, whose camera looks up at the surface")
         return self
 
     @property
     def shows_dock(self) -> bool:
         """Whether a spot can be a light of the dock."""
-        return self.spots.dock and self.spots.mirror == "none"
+        return self.detections.dock and self.detections.mirror == "none"
 
 
 def shipped_scenarios() -> list[str]:

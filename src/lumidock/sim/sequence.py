@@ -22,13 +22,13 @@ from lumidock.camera import Camera, save_camera
 from lumidock.datatypes import Array, Indices
 from lumidock.errors import InputError, LumidockError
 from lumidock.geometry import quat_xyzw_from_rotation
+from lumidock.sim.detections import SimulatedFrame, simulated_frames
 from lumidock.sim.frames import Moment, Shot, Studio
 from lumidock.sim.knobs import Output
 from lumidock.sim.lens import Lens, calibrated_in_water
 from lumidock.sim.optics import Emitters
-from lumidock.sim.plan import Plan, controlled, exposed, metered, plan_of
 from lumidock.sim.scenario import Scenario
-from lumidock.sim.spots import SpotFrame, spot_frames
+from lumidock.sim.schedule import Schedule, controlled, exposed, metered, schedule_of
 from lumidock.sim.stream import OVER_EXPOSED, Row, rows_of
 from lumidock.sim.water import green_index
 from lumidock.station import Station
@@ -53,7 +53,7 @@ def render_frame(
     station: Station,
     camera: Camera,
     T_dock_cam: Array,
-    strays: Array,
+    spurious: Array,
     dark: Indices,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, Emitters, Array]:
@@ -71,7 +71,7 @@ def render_frame(
         p_dock=station.p_dock,
         transmission=np.ones(m),
         dark=np.asarray(dark, np.int64),
-        strays=strays,
+        spurious=spurious,
         surface=scenario.around.surface,
     )
     shot = studio.shoot(moment)
@@ -138,9 +138,9 @@ def _once(rows: list[Row]) -> list[Row]:
     return list({row.number: row for row in reversed(rows)}.values())[::-1]
 
 
-def _planned(scenario: Scenario, station: Station, camera: Camera, seed: int) -> tuple[Plan, list[Row]]:
+def _planned(scenario: Scenario, station: Station, camera: Camera, seed: int) -> tuple[Schedule, list[Row]]:
     """What is rendered, and the rows of timestamps.csv. Raises: InputError when there would be none."""
-    plan = plan_of(scenario, station, camera, seed)
+    plan = schedule_of(scenario, station, camera, seed)
     rows = rows_of(scenario.stream, plan.course.t_ns, np.random.default_rng([seed, 6]))
     if not rows:
         raise InputError(f"{scenario.name}: every frame is dropped")
@@ -179,14 +179,14 @@ def _mapped(pool: ProcessPoolExecutor, function: Callable[[Any], Any], items: It
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _write_frame(plan: Plan, out: Path, row: Row) -> _Written:
+def _write_frame(plan: Schedule, out: Path, row: Row) -> _Written:
     """Render the picture of one row to its file, and say what is in it."""
     picture, truth = _taken(plan, row)
     (out / "frames" / file_of(row, plan.scenario)).write_bytes(picture)
     return truth
 
 
-def _taken(plan: Plan, row: Row) -> tuple[bytes, _Written]:
+def _taken(plan: Schedule, row: Row) -> tuple[bytes, _Written]:
     """The file with the picture of one row, and what is in it."""
     studio, moment = plan.studio(row.shows), plan.moment(row.shows)
     if row.fault == "over_exposed":
@@ -235,7 +235,7 @@ def _truth_of(studio: Studio, shot: Shot, lost: bool) -> _Written:
     return _Written(lights, spurious)
 
 
-def _write_truth(plan: Plan, rows: list[Row], written: dict[Row, _Written], out: Path) -> None:
+def _write_truth(plan: Schedule, rows: list[Row], written: dict[Row, _Written], out: Path) -> None:
     """Calibration, stamps and truth, a row for each frame of the sequence."""
     scenario = plan.scenario
     lens = plan.studio(0).lens
@@ -277,7 +277,7 @@ def write_detections(scenario: Scenario, station: Station, camera: Camera, seed:
     """
     require_possible(scenario, detections=True)
     out.mkdir(parents=True, exist_ok=True)
-    frames = list(spot_frames(scenario, station, camera, seed))
+    frames = list(simulated_frames(scenario, station, camera, seed))
     names = [frame.detections.frame for frame in frames]
     t_ns = [frame.detections.t_ns for frame in frames]
     poses = np.array([frame.T_dock_cam for frame in frames])
@@ -287,26 +287,26 @@ def write_detections(scenario: Scenario, station: Station, camera: Camera, seed:
     )
     _write_poses(out, names, t_ns, poses)
     _write_csv(out / "detections.csv", DETECTION_COLUMNS, _detection_rows(frames))
-    _write_lights_truth(out, names, [_spot_truth(frame, station) for frame in frames])
-    _write_spurious(out, names, [_spot_spurious(frame) for frame in frames])
+    _write_lights_truth(out, names, [_detection_truth(frame, station) for frame in frames])
+    _write_spurious(out, names, [_detection_spurious(frame) for frame in frames])
     return len(frames)
 
 
 DETECTION_COLUMNS = ("frame", "u_px", "v_px", "radius_px", "flux", "p_light", "p_rear")
 
 
-def _detection_rows(frames: list[SpotFrame]) -> Iterator[list[object]]:
+def _detection_rows(frames: list[SimulatedFrame]) -> Iterator[list[object]]:
     for frame in frames:
         d = frame.detections
         for (u, v), p_light, p_rear in zip(d.uv, d.p_light, d.p_rear, strict=True):
             yield [d.frame, f"{u:.4f}", f"{v:.4f}", "", "", f"{p_light:.3g}", f"{p_rear:.3f}"]
 
 
-def _spot_spurious(frame: SpotFrame) -> list[Line]:
+def _detection_spurious(frame: SimulatedFrame) -> list[Line]:
     return [["injected", f"{u:.4f}", f"{v:.4f}"] for u, v in frame.detections.uv[frame.light < 0]]
 
 
-def _spot_truth(frame: SpotFrame, station: Station) -> list[Line]:
+def _detection_truth(frame: SimulatedFrame, station: Station) -> list[Line]:
     """A light is visible when it made a detection; bare detections have no signal-to-noise ratio."""
     rows: list[Line] = []
     for i in np.flatnonzero(frame.in_view):

@@ -18,7 +18,7 @@ from rosbags.interfaces import Nodetype
 from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
 from lumidock.streams import ros2
-from lumidock.vehicle import Vehicle
+from lumidock.streams.vehicle import Vehicle
 
 _TOPICS = (f"{ros2.PREFIX}/pose", f"{ros2.PREFIX}/status", "/tf", "/tf_static")
 _NUMBERS = {"bool": bool, "string": str, "octet": idl.byte}

@@ -8,7 +8,7 @@ from foxglove import Channel, Schema
 from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
 from lumidock.streams import ros2
-from lumidock.vehicle import Vehicle
+from lumidock.streams.vehicle import Vehicle
 
 _BACKLOG = 32  # messages that a client may be behind before the oldest are dropped
 

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import common
 
 from lumidock.datatypes import Array, Detections, Fix, Frame, Unusable
 from lumidock.geometry import se3_inverse, skew
-from lumidock.vehicle import Vehicle
+from lumidock.streams.vehicle import Vehicle
 
 R_LOCAL_DOCK = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _R_BODY_AERO = np.diag([1.0, -1.0, -1.0])  # of the body: REP-103 to aerospace axes

@@ -10,7 +10,7 @@ from mcap.writer import CompressionType, Writer
 from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
 from lumidock.streams import ros2
-from lumidock.vehicle import Vehicle
+from lumidock.streams.vehicle import Vehicle
 
 _FLUSH_S = 0.2  # what a killed run may lose, and what the next look at the clock takes
 

@@ -11,7 +11,7 @@ from pyarrow import csv
 from pyarrow import parquet as pq
 
 from lumidock.errors import InputError
-from lumidock.streams.runfolder import FIX_COLUMNS
+from lumidock.streams.run_folder import FIX_COLUMNS
 
 _TYPES = {
     **dict.fromkeys(FIX_COLUMNS, pa.float64()),

@@ -12,7 +12,13 @@ import numpy as np
 from lumidock.datatypes import Array, Detections, Fix, Guide, Match, Protection, Stage, Status
 from lumidock.errors import InputError
 from lumidock.geometry import pose_from_quat
-from lumidock.streams.runfolder import COVARIANCE_COLUMNS, FIX_COLUMNS, GUIDE_COLUMNS, LIGHT_COLUMNS, PROTECTION_COLUMNS
+from lumidock.streams.run_folder import (
+    COVARIANCE_COLUMNS,
+    FIX_COLUMNS,
+    GUIDE_COLUMNS,
+    LIGHT_COLUMNS,
+    PROTECTION_COLUMNS,
+)
 
 Row = dict[str, str]
 _POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")

@@ -58,14 +58,14 @@ class RerunLog:
         self._stream.disconnect()
 
     def _log_detections(self, fix: Fix) -> None:
-        spots = fix.match
-        if spots is None:
+        detections = fix.match
+        if detections is None:
             self._stream.log("dock/camera/image/lights", rr.Clear(recursive=False))
             return
-        named = [int(light) for light in spots.light]
+        named = [int(light) for light in detections.light]
         colors = [_SPURIOUS if i < 0 else _LAYER_COLORS[int(self._station.layer[i]) % 3] for i in named]
         labels = ["" if i < 0 else self._station.ids[i] for i in named]
-        points = rr.Points2D(spots.detections.uv + 0.5, colors=colors, labels=labels, radii=4.0)
+        points = rr.Points2D(detections.detections.uv + 0.5, colors=colors, labels=labels, radii=4.0)
         self._stream.log("dock/camera/image/lights", points)
 
     def _log_pose(self, fix: Fix) -> None:

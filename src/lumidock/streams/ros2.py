@@ -19,7 +19,7 @@ from lumidock.camera import Camera
 from lumidock.datatypes import Array, Detections, Fix, Frame, Unusable
 from lumidock.geometry import quat_xyzw_from_rotation, se3_inverse
 from lumidock.streams.jpeg import jpeg_of
-from lumidock.vehicle import Vehicle
+from lumidock.streams.vehicle import Vehicle
 
 STATUS_MSG = """\
 # What lumidock says of one frame. Numbers that it does not know are NaN.
@@ -226,9 +226,9 @@ def _annotations(fix: Fix, t_ns: int, light_ids: tuple[str, ...]) -> Any:  # noq
     """A ring around each detection, and the name of its light. Foxglove counts pixels from the corner of the first."""
     circles, texts, time = [], [], _time(t_ns)
     green, red, clear = (_make("foxglove_msgs/msg/Color", *rgba) for rgba in (_NAMED, _SPURIOUS, _CLEAR))
-    spots = fix.match.detections if fix.match else Detections.from_uv(fix.frame, t_ns, np.empty((0, 2)))
+    detections = fix.match.detections if fix.match else Detections.from_uv(fix.frame, t_ns, np.empty((0, 2)))
     named = fix.match.light if fix.match else np.empty(0, np.int64)
-    for (u, v), radius, light in zip(spots.uv + 0.5, spots.radius_px, named, strict=True):
+    for (u, v), radius, light in zip(detections.uv + 0.5, detections.radius_px, named, strict=True):
         diameter = 2.0 * max(8.0, 1.6 * float(np.nan_to_num(radius)) + 4.0)
         color = green if light >= 0 else red
         at = _make("foxglove_msgs/msg/Point2", float(u), float(v))

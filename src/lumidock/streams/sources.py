@@ -103,9 +103,9 @@ def _open_sequence(path: Path, camera: Path | None, station: Path | None, bits: 
     attitudes = _read_attitudes(attitude) if attitude.exists() else _Attitudes([], np.empty((0, 5)))
     inputs = (stamps, attitude) if attitude.exists() else (stamps,)
     if detections.exists():
-        spots, inputs = _read_detections(detections), (*inputs, detections)
+        by_frame, inputs = _read_detections(detections), (*inputs, detections)
         return Source(
-            path, "detections", lambda: _detections(rows, spots, attitudes), len(rows), camera, station, inputs
+            path, "detections", lambda: _detections(rows, by_frame, attitudes), len(rows), camera, station, inputs
         )
     return Source(path, "sequence", lambda: _sequence(path, rows, attitudes, bits), len(rows), camera, station, inputs)
 
@@ -215,15 +215,15 @@ def _inside(folder: Path, name: str) -> Path:
 
 def _read_detections(path: Path) -> dict[str, list[Row]]:
     """Rows of a table of detections by frame."""
-    spots: dict[str, list[Row]] = {}
+    detections: dict[str, list[Row]] = {}
     for row in _read_csv(path, ("frame", "u_px", "v_px")):
-        spots.setdefault(row["frame"], []).append(row)
-    return spots
+        detections.setdefault(row["frame"], []).append(row)
+    return detections
 
 
-def _detections(rows: list[Row], spots: dict[str, list[Row]], attitudes: _Attitudes) -> Iterator[Item]:
+def _detections(rows: list[Row], detections: dict[str, list[Row]], attitudes: _Attitudes) -> Iterator[Item]:
     def read(row: Row, t_ns: int) -> Item:
-        return _frame_detections(row["frame"], t_ns, spots.get(row["frame"], []), attitudes.at(t_ns))
+        return _frame_detections(row["frame"], t_ns, detections.get(row["frame"], []), attitudes.at(t_ns))
 
     return _in_order(rows, read)
 

@@ -11,7 +11,7 @@ from zenoh.ext import Int64, z_serialize
 from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
 from lumidock.streams import ros2
-from lumidock.vehicle import Vehicle
+from lumidock.streams.vehicle import Vehicle
 
 _NODE = "lumidock"
 _QOS = "::,10:,:,:,,"  # the defaults of ROS 2: reliable, volatile, the last ten

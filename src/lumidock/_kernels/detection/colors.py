@@ -1,0 +1,160 @@
+"""Colour of each spot: the light of blue, green and red over its background, read where the sensor is not saturated."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lumidock._kernels import inner, summing
+from lumidock._kernels.compiling import entry
+from lumidock._kernels.detection import samples
+from lumidock._kernels.detection.samples import Picture
+from lumidock.datatypes import Array, Indices
+
+_SAMPLES, _RIM_SAMPLES = 12, 9  # a side of a window at most: of the spot, and of its surroundings
+_CLIP_ROUNDS, _CLIP = 2, 2.5  # outliers of the background, in sigmas
+
+
+@entry
+def colors(
+    picture: Picture,
+    order: Indices,
+    linear: Array,
+    clipped: float,
+    uv: Array,
+    radius: Array,
+    ring: tuple[float, float],
+    clear_px: float,
+    least_reach_px: float,
+    decide: tuple[float, float, float, float],
+    p_rear: Array,
+) -> None:
+    """Write `p_rear` (N,) of the spots `uv` (N, 2), by their light of B, G, R over the background.
+
+    `order` (4,): colour of each plane. `linear` (256,) undoes the camera's gamma. A saturated core is white whatever
+    the lamp, so the ring around it is asked, from `clear_px` beyond its edge to `ring` radii + px. `decide`: see
+    `_of_light`. NaN where there is too little light.
+    """
+    pitch = 2 if picture.planes == 4 else 1
+    rim = np.empty((3, 2 * (_RIM_SAMPLES + 4) ** 2), np.float32)
+    light = np.empty((4, 3))  # of each colour: sum, number of samples, over the background, 1 sigma
+    for n in range(len(uv)):
+        u, v = uv[n]
+        outer, inside = ring[0] * radius[n] + ring[1], max(radius[n], least_reach_px)
+        burnt = _is_burnt(picture, clipped, u, v, inside)
+        low, high = (radius[n] + clear_px, outer) if burnt else (0.0, inside)
+        step = pitch * (1 + int(2.0 * (2.0 * outer + 2.0)) // (16 * pitch))
+        fine = max(step // 2 // pitch * pitch, pitch) if high < 8.0 else step
+        _add_disc(picture, order, linear, clipped, u, v, low, high, fine, light)
+        dark = _rim(picture, order, linear, u, v, outer, rim)
+        p_rear[n] = np.nan
+        if dark == 0 or min(light[1, 0], min(light[1, 1], light[1, 2])) == 0.0:
+            continue
+        for c in range(3):
+            level, spread = _clipped_moments(rim[c, :dark])
+            light[2, c] = light[0, c] / light[1, c] - level
+            light[3, c] = spread / np.sqrt(light[1, c]) + 1e-3
+        p_rear[n] = _of_light(light[2], light[3], decide)
+
+
+@inner
+def _add_disc(
+    picture: Picture,
+    order: Indices,
+    linear: Array,
+    clipped: float,
+    u: float,
+    v: float,
+    low: float,
+    high: float,
+    step: int,
+    light: Array,
+) -> None:
+    """Write the sums of light of each colour, and how many samples of it, between two radii around a place."""
+    light[:2] = 0.0
+    pitch = 2 if picture.planes == 4 else 1
+    center_u, center_v = u - 0.5 * (pitch - 1), v - 0.5 * (pitch - 1)
+    for y in _steps(v, high, picture.height, pitch, step):
+        for x in _steps(u, high, picture.width, pitch, step):
+            square = (x - center_u) ** 2 + (y - center_v) ** 2
+            if not low * low <= square <= high * high:
+                continue
+            most = 0.0
+            for p in range(picture.planes):
+                most = max(most, samples.sample(picture, p, y, x))
+            if most < clipped:
+                for p in range(picture.planes):
+                    light[0, order[p]] += _light(samples.sample(picture, p, y, x), linear)
+                    light[1, order[p]] += 1.0
+
+
+@inner
+def _rim(picture: Picture, order: Indices, linear: Array, u: float, v: float, outer: float, rim: Array) -> int:
+    """Write the light of each colour in the surroundings of a spot to `rim` (3, N); returns how many samples."""
+    pitch, reach, count = 2 if picture.planes == 4 else 1, 2.0 * outer + 2.0, 0
+    step = pitch * (1 + int(2.0 * reach) // (_RIM_SAMPLES * pitch))
+    for y in _steps(v, reach, picture.height, pitch, step):
+        for x in _steps(u, reach, picture.width, pitch, step):
+            if (x - u) ** 2 + (y - v) ** 2 > 2.25 * outer * outer and count < rim.shape[1]:
+                for p in range(picture.planes):
+                    rim[order[p], count] = _light(samples.sample(picture, p, y, x), linear)
+                count += 1
+    return count
+
+
+@inner
+def _of_light(signal: Array, sigma: Array, decide: tuple[float, float, float, float]) -> float:
+    """P(rear) from linear light (3,) of B, G, R and its error, NaN where it is too weak.
+
+    `decide`: blue over the larger of green and red where both layers are as likely, the spread of its logarithm, the
+    sigmas below which nothing is known, and the limit to 0 and 1.
+    """
+    ratio, softness, least, limit = decide
+    k = 2 if signal[2] > signal[1] else 1
+    if not max(signal[0] / sigma[0], signal[k] / sigma[k]) >= least:
+        return np.nan
+    blue, rest = max(signal[0], sigma[0]), max(signal[k], sigma[k])
+    odds = np.log(blue / rest / ratio) / np.hypot(softness, np.hypot(sigma[0] / blue, sigma[k] / rest))
+    return min(max(1.0 / (1.0 + np.exp(-odds)), limit), 1.0 - limit)
+
+
+@inner
+def _steps(center: float, reach: float, size: int, pitch: int, step: int) -> range:
+    """Rows or columns around a place, as far as they are in the picture."""
+    return range(max(int(center - reach), 0) // pitch * pitch, min(int(center + reach) + 2, size - pitch + 1), step)
+
+
+@inner
+def _light(value: float, linear: Array) -> float:
+    return float(linear[min(int(value + 0.5), 255)]) if len(linear) else value
+
+
+@inner
+def _is_burnt(picture: Picture, clipped: float, u: float, v: float, reach: float) -> bool:
+    """Whether any sample of a disc is saturated."""
+    step, channels = 1 + int(reach) // 8, 3 if picture.planes == 3 else 1
+    limit = clipped / picture.scale
+    for y in range(max(int(v - reach), 0), min(int(v + reach) + 2, picture.height), step):
+        for x in range(max(int(u - reach), 0), min(int(u + reach) + 2, picture.width), step):
+            if (x - u) ** 2 + (y - v) ** 2 <= reach * reach:
+                for p in range(channels):
+                    if samples.value(picture, y, channels * x + p) >= limit:
+                        return True
+    return False
+
+
+@summing
+def _clipped_moments(values: Array) -> tuple[float, float]:
+    """Mean and standard deviation without outliers."""
+    level, spread = 0.0, np.inf
+    for _ in range(_CLIP_ROUNDS + 1):
+        total, squares, count = 0.0, 0.0, 0
+        for x in values:
+            d, kept = x - level, abs(x - level) <= _CLIP * spread
+            total += d if kept else 0.0
+            squares += d * d if kept else 0.0
+            count += kept
+        if count == 0:
+            break
+        shift = total / count
+        level, spread = level + shift, np.sqrt(max(squares / count - shift * shift, 0.0))
+    return level, spread

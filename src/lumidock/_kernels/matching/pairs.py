@@ -1,0 +1,192 @@
+"""Poses from two named lights and the expected attitude, and what else is in place under them."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from lumidock._kernels.compiling import part
+from lumidock._kernels.lens import invert6
+from lumidock._kernels.matching.evidence import BEND, FAR_M, NEAR_M, PAIR_GATE, ROLL_GATE, Scene, innovation, survey_var
+from lumidock._kernels.matching.gates import Sight, occupied
+from lumidock._kernels.pose import light_row
+from lumidock.datatypes import Array, Indices
+
+
+class Pair(NamedTuple):
+    """Lights `a` and `b` named `i` and `j`, with the depth `z` m of `a` and the roll rad that this leads to."""
+
+    a: int
+    b: int
+    i: int
+    j: int
+    z: float
+    roll: float
+
+
+class View(NamedTuple):
+    """A pose of which two pixels and the expected attitude are known.
+
+    Of each detection the light, `taken` (N,) or -1, and the pose `R`, `t`. `open` (3, 6) is the information of the
+    prior; `H` and `L` (6, 6) are work space.
+    """
+
+    taken: Indices
+    R: Array
+    t: Array
+    open: Array
+    H: Array
+    L: Array
+
+
+@part
+def new_view(scene: Scene) -> View:
+    """Room for a view in which no detection is taken yet."""
+    taken = np.full(len(scene.uv), -1, np.int64)
+    open_ = np.zeros((3, 6))
+    _open_attitude(scene, open_)
+    return View(taken, np.empty((3, 3)), np.empty(3), open_, np.empty((6, 6)), np.empty((6, 6)))
+
+
+@part
+def _open_attitude(scene: Scene, open_: Array) -> None:
+    """Add the information (3, 6) that the attitude prior has of a pose; of rotation, the last three columns.
+
+    At the expected attitude its Jacobian is, whatever the roll, -y, x and -z of `cam` in dock axes.
+    """
+    for m in range(3):
+        axis = 1 - m if m < 2 else 2
+        for k in range(3):
+            for o in range(3):
+                open_[k, 3 + o] += scene.info[m] * scene.Rp[k, axis] * scene.Rp[o, axis]
+
+
+@part
+def pair_poses(
+    a: int, b: int, least: int, scene: Scene, view: View, sight: Sight, budget: Indices, tries: Array
+) -> int:
+    """All pairs of detections that lights `a` and `b` may have made.
+
+    Fills rows of `tries`: how many other lights of the layer are in place, the two detections, depth of `a`, and roll.
+    Pairs with fewer than `least` in place are left out, and all that exceed the `budget` (1,). Returns how many rows.
+    """
+    n, found, taken = len(scene.uv), 0, view.taken
+    d, sols = np.empty(3), np.empty((2, 2))
+    for k in range(3):  # R_cam_dock of the prior is Rp^T
+        d[k] = 0.0
+        for o in range(3):
+            d[k] += scene.Rp[o, k] * (scene.p[b, o] - scene.p[a, o])
+    for i in range(n):
+        for j in range(n):
+            if i == j or not (scene.ray[i, 2] > 0.0 and scene.ray[j, 2] > 0.0):
+                continue
+            for sol in range(_pair_pose(d, scene.ray[i], scene.ray[j], scene.q, sols)):
+                budget[0] -= 1
+                if budget[0] < 0:
+                    return found
+                pair = Pair(a, b, i, j, sols[sol, 0], sols[sol, 1])
+                know_pair(pair, scene, view, sight.rows[a], sight.P)
+                taken[i], taken[j] = a, b
+                support = in_place(pair, least, scene, view, sight)
+                taken[i], taken[j] = -1, -1
+                if support >= least:
+                    tries[found, 0], tries[found, 1], tries[found, 2] = support, i, j
+                    tries[found, 3], tries[found, 4] = pair.z, pair.roll
+                    found += 1
+    return found
+
+
+@part
+def _pair_pose(d: Array, ray_i: Array, ray_j: Array, q: Array, out: Array) -> int:
+    """Depth of the first light and roll that put two lights `d` (3,) apart in the prior's `cam` axes on two rays.
+
+    Fills up to two rows of `out` (2, 2); returns how many lie within the gates.
+    """
+    xi, yi = ray_i[0] / ray_i[2], ray_i[1] / ray_i[2]
+    xj, yj = ray_j[0] / ray_j[2], ray_j[1] / ray_j[2]
+    dx, dy = xj - xi, yj - yi
+    A = dx * dx + dy * dy
+    B = d[2] * (dx * xj + dy * yj)
+    C = d[2] * d[2] * (xj * xj + yj * yj) - (d[0] * d[0] + d[1] * d[1])
+    root = B * B - A * C
+    if A <= 0.0 or root < 0.0:
+        return 0
+    root = math.sqrt(root)
+    found = 0
+    for sign in (1.0, -1.0):
+        z = (-B + sign * root) / A
+        if not q[NEAR_M] < z < q[FAR_M] or z + d[2] < q[NEAR_M]:
+            continue
+        ex, ey = z * dx + d[2] * xj, z * dy + d[2] * yj
+        roll = math.atan2(d[0] * ey - d[1] * ex, d[0] * ex + d[1] * ey)
+        if abs(roll) > q[ROLL_GATE]:
+            continue
+        out[found, 0], out[found, 1] = z, roll
+        found += 1
+    return found
+
+
+@part
+def know_pair(pair: Pair, scene: Scene, view: View, h: Array, P: Array) -> None:
+    """Pose, in `view`, and covariance `P` (6, 6) of two named lights and the expected attitude; `h` (14,) is spare."""
+    a, b, i, j, z, roll = pair
+    R, t = view.R, view.t
+    _pose_of(scene.Rp, roll, z, scene.ray[i], scene.p[a], R, t)
+    H = view.H
+    for m in range(3):
+        for o in range(6):
+            H[m, o], H[3 + m, o] = 0.0, view.open[m, o]
+    for k in range(2):
+        c, d = (a, i) if k == 0 else (b, j)
+        if light_row(scene.lens, R, t, scene.p[c], h):
+            w = 1.0 / (scene.var[d] + survey_var(scene.lens, R, t, scene.p[c], scene.survey_m2[c]))
+            for m in range(6):
+                for o in range(m + 1):
+                    H[m, o] += w * (h[2 + m] * h[2 + o] + h[8 + m] * h[8 + o])
+    invert6(H, view.L, P)
+
+
+@part
+def _pose_of(Rp: Array, roll: float, z: float, ray: Array, p: Array, R: Array, t: Array) -> None:
+    """Pose of the prior attitude turned by `roll`, with the light at `p` at depth `z` on `ray`."""
+    c, s = math.cos(roll), math.sin(roll)
+    for k in range(3):
+        R[0, k] = c * Rp[k, 0] - s * Rp[k, 1]
+        R[1, k] = s * Rp[k, 0] + c * Rp[k, 1]
+        R[2, k] = Rp[k, 2]
+    for k in range(3):
+        t[k] = z * ray[k] / ray[2] - (R[k, 0] * p[0] + R[k, 1] * p[1] + R[k, 2] * p[2])
+
+
+@part
+def in_place(pair: Pair, least: int, scene: Scene, view: View, sight: Sight) -> int:
+    """How many other lights of the layer have a free detection in their gate; fills the `sight` with where they are.
+
+    Ends early where `least` can no longer be reached. One function with its arrays at hand: it is half of all work.
+    """
+    loosest, by_u = scene.loosest, scene.by_u
+    lens, p, layer, survey_m2, uv, var = scene.lens, scene.p, scene.layer, scene.survey_m2, scene.uv, scene.var
+    rows, there, extra, P, R, t, taken = sight.rows, sight.there, sight.extra, sight.P, view.R, view.t, view.taken
+    gate, bend, a, b = scene.q[PAIR_GATE], scene.q[BEND], pair.a, pair.b
+    mu, mv = 0.5 * (uv[pair.i, 0] + uv[pair.j, 0]), 0.5 * (uv[pair.i, 1] + uv[pair.j, 1])
+    support, left = 0, -2
+    for c in range(len(p)):
+        left += layer[c] == layer[a]
+    for c in range(len(p)):
+        there[c] = False
+        if c == a or layer[c] != layer[a] or c == b:  # noqa: SIM109 - slow in numba
+            continue
+        if support + left < least:
+            break
+        left -= 1
+        h, S = rows[c], sight.S[c]
+        if not light_row(lens, R, t, p[c], h):
+            continue
+        there[c] = True
+        du, dv = h[0] - mu, h[1] - mv
+        extra[c] = survey_var(lens, R, t, p[c], survey_m2[c]) + bend * (du * du + dv * dv)
+        innovation(h, P, extra[c], S)
+        support += occupied(h[0], h[1], S, taken, uv, var, loosest, by_u, gate)
+    return support

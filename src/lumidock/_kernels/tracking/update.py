@@ -1,0 +1,237 @@
+"""The filter's update: all named pixels of a frame at once, and what leaving each light out would do."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from lumidock._kernels.compiling import entry, part
+from lumidock._kernels.lens import copy_to, factor
+from lumidock._kernels.matching.evidence import named_lights
+from lumidock._kernels.pose import set_pose
+from lumidock._kernels.tracking.levels import outputs
+from lumidock._kernels.tracking.slant import flatten
+from lumidock._kernels.tracking.track import State, apply, difference, dot_row, gains, row
+from lumidock.datatypes import Array, Indices
+
+_SETTLED = 0.5  # sigmas; a pose that still moves by more in the last step is none
+
+
+class Pixels(NamedTuple):
+    """Detections `uv` (N, 2) px with covariance `cov` (N, 2, 2) px^2, and `name` (M,), that of each light or -1."""
+
+    name: Indices
+    uv: Array
+    cov: Array
+
+
+class _Rows(NamedTuple):
+    """Of m named `lights` (m,): pixel and Jacobian `h` (m, 14) and `cal` (m, 2) of each, as in `row`.
+
+    `Z` (2 m, 2 m) is the factor L of their innovation's covariance, and `G` (2 m, n) is L^-1 H P.
+    """
+
+    lights: Indices
+    h: Array
+    cal: Array
+    Z: Array
+    G: Array
+
+
+@entry
+def take_in(
+    lens: Array,
+    p: Array,
+    R0: Array,
+    t0: Array,
+    state: State,
+    pixels: Pixels,
+    estimated: int,
+    steps: int,
+    plane: Array,
+    turn_cov: Array,
+    tracking: bool,
+    apart: Array,
+) -> float:
+    """Take in the named pixels, all in one, relinearised up to `steps` times; in place. Returns the NIS.
+
+    `R0`, `t0` are the mean that `P` belongs to, those of `state` where to linearise first. Where the lights are one
+    `plane` (6,) (a point and the normal; NaN: none), the covariance is that of the flattest view within three sigmas of
+    tilt by `turn_cov` (3, 3): seen at a slant by mistake, a plane would seem to tell its tilt. When `tracking` the gain
+    is that of the flattest view as well, so that history rests on perspective and not on the choice between two slants.
+
+    Only the first `estimated` states move; the others are considered: they keep their covariance and lend it to the
+    rest (S. F. Schmidt, 1966). `apart` (M, 18) is, for each named light, how far the nine `outputs` would move without
+    it, and the variance that leaving it out adds to each. NIS is NaN on failure.
+    """
+    R, t, x, P = state
+    lights, n, slanted = named_lights(pixels.name), len(P), not math.isnan(plane[0])
+    m = 2 * len(lights)
+    rows = _Rows(lights, np.empty((len(lights), 14)), np.empty((len(lights), 2)), np.empty((m, m)), np.empty((m, n)))
+    nu, w, dx, before, x0 = np.empty(m), np.empty(m), np.zeros(n), np.zeros(6), x.copy()
+    flat, change = State(R.copy(), t.copy(), x, P), 0.0
+    difference(R0, t0, R, t, dx)
+    for step in range(steps):
+        set_pose(flat.R, flat.t, R, t)
+        if slanted and tracking:
+            flatten(R, t, plane, turn_cov, flat.R, flat.t)
+        if not _whiten(lens, p, flat, pixels, rows):
+            return np.nan
+        if slanted and tracking and not _see(lens, p, state, rows):
+            return np.nan
+        _innovate(pixels, dx, rows, nu)
+        _forward(rows.Z, nu, w)
+        for j in range(n):
+            dx[j] = 0.0
+        for r in range(m):
+            for j in range(estimated):
+                dx[j] += w[r] * rows.G[r, j]
+        set_pose(R, t, R0, t0)
+        copy_to(x0, x)
+        apply(R, t, x, dx)
+        change = 0.0  # of the pose since the step before, in sigmas of the prediction
+        for j in range(6):
+            change = max(change, abs(dx[j] - before[j]) / math.sqrt(P[j, j]))
+            before[j] = dx[j]
+        if step > 0 and change < 0.02:
+            break
+        if step == 0 and change < 0.3 and P[3, 3] + P[4, 4] + P[5, 5] < 1e-4:
+            break
+    if tracking and change > _SETTLED:
+        return np.nan
+    square = 0.0
+    for r in range(m):
+        square += w[r] * w[r]
+    if slanted:
+        set_pose(flat.R, flat.t, R, t)
+        flatten(R, t, plane, turn_cov, flat.R, flat.t)
+        if not _whiten(lens, p, flat, pixels, rows):
+            return np.nan
+        _forward(rows.Z, nu, w)
+    _shrink(P, rows.G, estimated)
+    _separate(rows, w, outputs(R, t), apart)
+    return square
+
+
+@part
+def _whiten(lens: Array, p: Array, state: State, pixels: Pixels, rows: _Rows) -> bool:
+    """Fill all of `rows` but its lights at a state; False where a light is out of the lens's sight."""
+    lights, h, cal, Z, G = rows
+    m, n, at = len(lights), len(state.P), np.empty(3)
+    for k in range(m):
+        if not row(lens, state, p, lights[k], at, h[k], cal[k]):
+            return False
+        gains(state.P, h[k], cal[k], lights[k], G[2 * k], G[2 * k + 1])
+    for k in range(m):
+        c, cov = lights[k], pixels.cov[pixels.name[lights[k]]]
+        for r in range(2 * k, 2 * m):
+            Z[r, 2 * k] = dot_row(G[r], h[k], cal[k], 0, c)
+            Z[r, 2 * k + 1] = dot_row(G[r], h[k], cal[k], 1, c)
+        Z[2 * k, 2 * k] += cov[0, 0]
+        Z[2 * k + 1, 2 * k] += cov[1, 0]
+        Z[2 * k + 1, 2 * k + 1] += cov[1, 1]
+    if math.isnan(factor(Z, 2 * m)):
+        return False
+    for r in range(2 * m):
+        for k in range(0, r - 1, 2):
+            y, z = Z[r, k], Z[r, k + 1]
+            for j in range(n):
+                G[r, j] = G[r, j] - y * G[k, j] - z * G[k + 1, j]
+        if r % 2:
+            z = Z[r, r - 1]
+            for j in range(n):
+                G[r, j] -= z * G[r - 1, j]
+        z = 1.0 / Z[r, r]
+        for j in range(n):
+            G[r, j] *= z
+    return True
+
+
+@part
+def _see(lens: Array, p: Array, state: State, rows: _Rows) -> bool:
+    """Put the pixels of another state into `rows`, whose Jacobians stay; False where a light is out of sight."""
+    at, h, cal = np.empty(3), np.empty(14), np.empty(2)
+    for k in range(len(rows.lights)):
+        if not row(lens, state, p, rows.lights[k], at, h, cal):
+            return False
+        rows.h[k, 0], rows.h[k, 1] = h[0], h[1]
+    return True
+
+
+@part
+def _innovate(pixels: Pixels, dx: Array, rows: _Rows, nu: Array) -> None:
+    """Innovation `nu` (2 m,) against the prediction, from which the state is `dx` (n,) away."""
+    for k in range(len(rows.lights)):
+        c, h, cal = rows.lights[k], rows.h[k], rows.cal[k]
+        i = pixels.name[c]
+        nu[2 * k] = pixels.uv[i, 0] - h[0] + dot_row(dx, h, cal, 0, c)
+        nu[2 * k + 1] = pixels.uv[i, 1] - h[1] + dot_row(dx, h, cal, 1, c)
+
+
+@part
+def _forward(Z: Array, nu: Array, w: Array) -> None:
+    """Solve Z w = nu for a lower triangle."""
+    for r in range(len(nu)):
+        s = nu[r]
+        for k in range(r):
+            s -= Z[r, k] * w[k]
+        w[r] = s / Z[r, r]
+
+
+@part
+def _shrink(P: Array, G: Array, estimated: int) -> None:
+    """Take the information of an update out of `P` (n, n), but not from what is only considered; `G` (2 m, n)."""
+    for i in range(len(P)):
+        end = i + 1 if i < estimated else estimated
+        for r in range(0, len(G), 2):
+            u, v = G[r, i], G[r + 1, i]
+            for j in range(end):
+                P[i, j] = P[i, j] - u * G[r, j] - v * G[r + 1, j]
+        for j in range(end):
+            P[j, i] = P[i, j]
+
+
+@part
+def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
+    """One-fault solution separation: what leaving each light out of the update would do to the outputs `C`.
+
+    With S = L L^T the innovation's covariance (`Z`), `G` = L^-1 H P, `w` = L^-1 nu and V the columns of L^-1 that
+    belong to a light's two rows, leaving them out moves the state by -G^T V (V^T V)^-1 V^T w and adds the variance
+    G^T V (V^T V)^-1 V^T G: block elimination, exact also where states are only considered.
+    """
+    lights, Z, G, m = rows.lights, rows.Z, rows.G, len(rows.lights)
+    V, U, Y = np.empty((2 * m, 2)), np.empty((9, 2)), np.empty((2, 6))
+    for c in range(len(apart)):
+        for j in range(18):
+            apart[c, j] = 0.0
+    for k in range(m):
+        a = b = d = wu = wv = 0.0
+        for o in range(6):
+            Y[0, o] = Y[1, o] = 0.0
+        for r in range(2 * k, 2 * m):
+            su, sv = 1.0 if r == 2 * k else 0.0, 1.0 if r == 2 * k + 1 else 0.0
+            for q in range(2 * k, r):
+                su -= Z[r, q] * V[q, 0]
+                sv -= Z[r, q] * V[q, 1]
+            V[r, 0], V[r, 1] = su / Z[r, r], sv / Z[r, r]
+            for o in range(6):
+                Y[0, o] += G[r, o] * V[r, 0]
+                Y[1, o] += G[r, o] * V[r, 1]
+            a += V[r, 0] * V[r, 0]
+            b += V[r, 0] * V[r, 1]
+            d += V[r, 1] * V[r, 1]
+            wu += V[r, 0] * w[r]
+            wv += V[r, 1] * w[r]
+        det = a * d - b * b
+        for j in range(9):
+            U[j, 0] = U[j, 1] = 0.0
+            for o in range(6):
+                U[j, 0] += C[j, o] * Y[0, o]
+                U[j, 1] += C[j, o] * Y[1, o]
+        c = lights[k]
+        for j in range(9):
+            u, v = (d * U[j, 0] - b * U[j, 1]) / det, (a * U[j, 1] - b * U[j, 0]) / det
+            apart[c, j] = -(u * wu + v * wv)
+            apart[c, 9 + j] = u * U[j, 0] + v * U[j, 1]

@@ -1,0 +1,336 @@
+"""Live guidance: the newest frame through the localizer to the vehicle, while everything slower drops what is old.
+
+One thread reads the camera into a slot that holds the newest frame only. The caller's thread localizes and offers the
+fix to the sinks, each of which has a thread and a short queue of its own, so that none can delay the next fix.
+"""
+
+from __future__ import annotations
+
+import gc
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from lumidock.app.run import process
+from lumidock.datatypes import Fix, Frame, Stage, Unusable
+from lumidock.errors import LumidockError
+from lumidock.methods import Method
+from lumidock.streams.sinks import Sink
+from lumidock.streams.sources import Item
+
+_RECENT = 1000  # frames that rates and latencies are taken over
+_TICK_S = 0.2  # between looks at a sink that has nothing to do
+_LOOK_S = 0.05  # that a recording waits at most for a picture to be looked at
+_RETRY_S = 1.0  # until a lost camera or a failed sink is tried again
+_AFTER_YOU_S = 0.01  # in which the vehicle is told, before what can wait takes the processor
+_OPENING_S = 2.0  # all sinks together may take before the first frame
+_CLOSING_S = 5.0  # a sink may take to write what is left
+_LOOP_PAUSE_NS = 3_000_000_000  # between two passes over a recording: no track is carried across
+STALE_S = 0.25  # ArduPilot takes an estimate for lost after 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """A frame and when it arrived, on the monotonic clock."""
+
+    item: Item
+    at_s: float
+
+
+class Newest:
+    """A slot for one frame; a newer one replaces it."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._taken: Taken | None = None
+        self._idle = threading.Event()
+        self.dropped = 0
+
+    def put(self, item: Item) -> None:
+        """Replace what is there."""
+        with self._changed:
+            self.dropped += self._taken is not None
+            self._taken = Taken(item, time.monotonic())
+            self._idle.clear()
+            self._changed.notify()
+
+    def get(self, timeout_s: float) -> Taken | None:
+        """Take the newest frame; None when none comes in time."""
+        with self._changed:
+            if self._taken is None:
+                self._idle.set()
+                self._changed.wait(timeout_s)
+            taken, self._taken = self._taken, None
+            return taken
+
+    def wait_until_idle(self, timeout_s: float) -> None:
+        """Wait until whoever takes the frames has done with the last one."""
+        self._idle.wait(timeout_s)
+
+
+class Camera(threading.Thread):
+    """Reads a source into a slot, and opens it again when it is lost; a recording is shown at its own pace."""
+
+    def __init__(
+        self, open_items: Callable[[], Iterator[Item]], newest: Newest, *, live: bool, loop: bool, stop: threading.Event
+    ) -> None:
+        super().__init__(name="camera", daemon=True)
+        self._open, self._newest, self._live, self._loop, self._halt = open_items, newest, live, loop, stop
+        self.frames, self.reconnects, self.problem, self.ended = 0, 0, "", False
+        self._offset_ns = self._passes = 0
+
+    def run(self) -> None:
+        """Read until told to stop, or to the end of a recording."""
+        while not self._halt.is_set():
+            try:
+                self._pass()
+                self.problem = "the stream ended" if self._live and not self._halt.is_set() else ""
+            except (LumidockError, OSError) as error:
+                self.problem = str(error)
+            if not self._live and (not self._loop or self.problem):
+                break
+            self._passes += 1
+            if self._live:
+                self.reconnects += 1
+                self._halt.wait(_RETRY_S)
+        self.ended = True
+
+    def _pass(self) -> None:
+        start_s, first_ns, last_ns = time.monotonic(), None, 0
+        for item in self._open():
+            if self._halt.is_set():
+                return
+            if not self._live and item.t_ns is not None:
+                first_ns = item.t_ns if first_ns is None else first_ns
+                self._halt.wait(max(0.0, start_s + (item.t_ns - first_ns) * 1e-9 - time.monotonic()))
+                last_ns = max(last_ns, item.t_ns)
+            self.frames += 1
+            self.problem = ""
+            self._newest.put(_of_pass(item, self._passes, self._offset_ns))
+            if not self._live:  # a camera has no next picture to decode while this one is looked at
+                self._newest.wait_until_idle(_LOOK_S)
+                self._halt.wait(_AFTER_YOU_S)
+        if self._loop and first_ns is not None:
+            self._offset_ns += last_ns - first_ns + _LOOP_PAUSE_NS
+            self._halt.wait(_LOOP_PAUSE_NS * 1e-9)
+
+
+def _of_pass(item: Item, number: int, offset_ns: int) -> Item:
+    """The same frame with a name and a stamp of its own, when a source is read once more."""
+    if not number:
+        return item
+    t_ns = None if item.t_ns is None else item.t_ns + offset_ns
+    if isinstance(item, Frame):
+        return replace(item, name=f"{number}.{item.name}", t_ns=item.t_ns + offset_ns)
+    if isinstance(item, Unusable):
+        return replace(item, frame=f"{number}.{item.frame}", t_ns=t_ns)
+    return replace(item, frame=f"{number}.{item.frame}", t_ns=item.t_ns + offset_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """A localized frame on its way to a sink."""
+
+    taken: Taken
+    fix: Fix
+    latency_us: int | None
+
+
+def _without_picture(done: Done) -> Done:
+    item = done.taken.item
+    if not isinstance(item, Frame):
+        return done
+    return replace(done, taken=Taken(Unusable(item.name, item.t_ns, "", ""), done.taken.at_s))
+
+
+class Worker(threading.Thread):
+    """Feeds one sink from a queue that drops its oldest; a sink that fails is opened again."""
+
+    def __init__(
+        self,
+        name: str,
+        open_sink: Callable[[], Sink],
+        *,
+        queue: int,
+        stale_s: float | None = None,
+        pictures: bool = True,
+        patient: bool = False,
+    ) -> None:
+        """Feed the sink that `open_sink` opens; without `pictures` it is given the frames' names and stamps alone.
+
+        A `patient` one, for people or for later, begins with a frame when the vehicle has been told.
+        """
+        super().__init__(name=name, daemon=True)
+        self._open, self._queue, self._stale_s = open_sink, deque[Done](maxlen=queue), stale_s
+        self._pictures, self._patient = pictures, patient
+        self._changed, self._halt = threading.Condition(), False
+        self.tried = threading.Event()  # whether the sink has been opened, well or not
+        self.sent, self.dropped, self.stale, self.errors, self.problem = 0, 0, 0, 0, ""
+        self.delay_s = deque[float](maxlen=_RECENT)  # from the frame's arrival to the end of sending
+
+    def offer(self, done: Done) -> None:
+        """Queue a fix, in place of the oldest where the queue is full; never waits."""
+        with self._changed:
+            self.dropped += len(self._queue) == self._queue.maxlen
+            self._queue.append(done if self._pictures else _without_picture(done))
+            self._changed.notify()
+
+    def finish(self) -> None:
+        """Send what is queued, close the sink and end; a sink that hangs is left behind."""
+        with self._changed:
+            self._halt = True
+            self._changed.notify()
+        self.join(_CLOSING_S)
+
+    def run(self) -> None:
+        """Open, feed and close the sink, again and again if need be."""
+        while not self._over():
+            try:
+                sink = self._open()
+                self.tried.set()
+                try:
+                    self._feed(sink)
+                finally:
+                    sink.close()
+            except (OSError, LumidockError, RuntimeError, ValueError) as error:
+                self.errors += 1
+                self.problem = " ".join(str(error).split()) or type(error).__name__
+                self.tried.set()
+                self._pause()
+
+    def _over(self) -> bool:
+        with self._changed:
+            return self._halt and not self._queue
+
+    def _pause(self) -> None:
+        """Let a sink that failed rest; what is queued meanwhile is given up when it is time to end."""
+        end = time.monotonic() + _RETRY_S
+        with self._changed:
+            while not self._halt and time.monotonic() < end:
+                self._changed.wait(end - time.monotonic())
+            if self._halt:
+                self._queue.clear()
+
+    def _feed(self, sink: Sink) -> None:
+        tick: Callable[[], None] = getattr(sink, "tick", lambda: None)
+        while True:
+            with self._changed:
+                if not self._queue and not self._halt:
+                    self._changed.wait(_TICK_S)
+                done = self._queue.popleft() if self._queue else None
+                if done is None and self._halt:
+                    return
+            tick()
+            if done is not None:
+                if self._patient:  # not a lower priority: who then holds the interpreter keeps everybody waiting
+                    time.sleep(_AFTER_YOU_S)
+                self._send(sink, done)
+
+    def _send(self, sink: Sink, done: Done) -> None:
+        age_s = time.monotonic() - done.taken.at_s
+        if self._stale_s is not None and age_s > self._stale_s:
+            self.stale += 1
+            return
+        sink.add(done.taken.item, done.fix, done.latency_us)
+        self.sent += 1
+        self.problem = ""
+        self.delay_s.append(time.monotonic() - done.taken.at_s)
+
+
+@dataclass(slots=True)
+class Server:
+    """Camera, localizer and sinks, and what is known of their health."""
+
+    localizer: Method
+    camera: Camera
+    newest: Newest
+    workers: list[Worker]
+    stop: threading.Event
+    reasons: Counter[str] = field(default_factory=Counter)
+    counts: Counter[str] = field(default_factory=Counter)
+    arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
+    latency_us: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
+    last: Fix | None = None
+    started_s: float = field(default_factory=time.monotonic)
+
+    def serve(self) -> None:
+        """Localize the newest frame, over and over, until told to stop or the recording ends."""
+        stage: Stage = "search"
+        gc.collect()
+        gc.freeze()  # what is alive now stays, and would be looked at in every long pause of the collector
+        for worker in self.workers:
+            worker.start()
+        ready_s = time.monotonic() + _OPENING_S
+        for worker in self.workers:  # what is slow to open would be behind from the first frame on
+            worker.tried.wait(max(0.0, ready_s - time.monotonic()))
+        self.camera.start()
+        try:
+            while not self.stop.is_set():
+                taken = self.newest.get(0.1)
+                if taken is not None:
+                    stage = self._localize(taken, stage)
+                elif self.camera.ended:
+                    break
+        finally:
+            self.stop.set()
+            for worker in self.workers:
+                worker.finish()
+            self.camera.join(_CLOSING_S)
+            gc.unfreeze()
+
+    def _localize(self, taken: Taken, stage: Stage) -> Stage:
+        fix, latency_us, _ = process(self.localizer, taken.item, stage)
+        for worker in self.workers:
+            worker.offer(Done(taken, fix, latency_us))
+        self.arrivals_s.append(taken.at_s)
+        if latency_us is not None:
+            self.latency_us.append(latency_us)
+        self.counts.update(frames=1, valid=int(fix.valid), guide=int(fix.guide is not None))
+        if fix.reason:
+            self.reasons[fix.reason] += 1
+        self.last = fix
+        return fix.stage
+
+    def health(self) -> dict[str, Any]:
+        """Rates, latencies, drops and reasons, for the page and for machines."""
+        now, arrivals = time.monotonic(), list(self.arrivals_s)
+        age_s = now - arrivals[-1] if arrivals else None
+        span_s = arrivals[-1] - arrivals[0] if len(arrivals) > 1 else 0.0
+        last = self.last
+        return {
+            "ok": age_s is not None and age_s < 2.0 * _RETRY_S and not self.camera.problem,
+            "up_s": now - self.started_s,
+            "camera": {
+                "frames": self.camera.frames,
+                "rate_hz": (len(arrivals) - 1) / span_s if span_s else None,
+                "last_frame_s_ago": age_s,
+                "dropped": self.newest.dropped,
+                "reconnects": self.camera.reconnects,
+                "problem": self.camera.problem,
+            },
+            "fixes": {
+                **{word: self.counts[word] for word in ("frames", "valid", "guide")},
+                "reasons": dict(self.reasons),
+                "last": None if last is None else {"status": last.status, "stage": last.stage, "reason": last.reason},
+                "latency_ms": percentiles([us / 1000.0 for us in list(self.latency_us)]),
+            },
+            "sinks": {
+                worker.name: {
+                    **{word: getattr(worker, word) for word in ("sent", "dropped", "stale", "errors", "problem")},
+                    "frame_to_sent_ms": percentiles([1000.0 * s for s in list(worker.delay_s)]),
+                }
+                for worker in self.workers
+            },
+        }
+
+
+def percentiles(values: list[float]) -> dict[str, float]:
+    """Median, 99 % and largest of some values; empty where there are none."""
+    if not values:
+        return {}
+    return {name: round(float(np.percentile(values, q)), 3) for name, q in (("p50", 50), ("p99", 99), ("max", 100))}

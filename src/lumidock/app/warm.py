@@ -1,0 +1,112 @@
+"""Compiling ahead: a made-up docking before the first real frame, so that no vehicle waits for its first fix."""
+
+from __future__ import annotations
+
+import gc
+import signal
+from collections.abc import Callable, Iterator
+from multiprocessing import get_context
+
+import numpy as np
+
+from lumidock import detect, layers
+from lumidock.camera import Camera
+from lumidock.config import Config
+from lumidock.datatypes import Array, Detections, Fix, Frame
+from lumidock.geometry import se3_inverse, transform_points
+from lumidock.localizer import Localizer
+from lumidock.station import Station
+
+_FRAMES, _STEP_NS, _STEP = 8, 100_000_000, 0.02
+_BLANK = 5  # the frame without lights, after which the track has to be taken up again
+_FORMATS = {"8 bits": ("bgr8", 255), "16 bits": ("bayer_rggb16", 65535)}
+_OBJECTS = 50_000  # made between two searches for garbage, of which compiling leaves little
+_AWAY = 3.0  # and _STEP in widths of the array, all of whose lights are in the picture then
+
+
+def compile_ahead(station: Station, camera: Camera) -> None:
+    """Compile detection and matching into numba's cache, at the same time in two processes.
+
+    What one of them could not, `warm_up` does.
+    """
+    spawn = get_context("spawn")  # a fork would inherit the locks of OpenCV's threads
+    parts = [spawn.Process(target=_run, args=(part, station, camera), daemon=True) for part in (_detection, _matching)]
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is the parent's, whose end is theirs
+    try:
+        for part in parts:
+            part.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    for part in parts:
+        part.join()
+
+
+def _run(part: Callable[[Station, Camera], None], station: Station, camera: Camera) -> None:
+    gc.set_threshold(_OBJECTS)
+    part(station, camera)
+
+
+def _detection(station: Station, camera: Camera) -> None:
+    config = Config()
+    for _, frames in _films(station, camera):
+        frame = next(frames)
+        found = detect.lights(frame, config.detect, detect.Scan(frame, config.detect), None)
+        layers.label(frame, found, config.label)
+
+
+def _matching(station: Station, camera: Camera) -> None:
+    localizer = Localizer(station, camera)
+    for k in range(_FRAMES):
+        localizer.process_detections(Detections.from_uv(str(k), k * _STEP_NS, _view(station, camera, k)))
+
+
+def warm_up(process: Callable[[Frame], Fix], station: Station, camera: Camera) -> Iterator[tuple[str, Fix]]:
+    """Show the image door of a localizer, to be thrown away after, a drawn dock in every format of pixels.
+
+    Yields each format and its last fix. What is compiled stays in this process and in numba's cache on disk.
+    """
+    for name, frames in _films(station, camera):
+        yield name, [process(frame) for frame in frames][-1]
+
+
+def _films(station: Station, camera: Camera) -> Iterator[tuple[str, Iterator[Frame]]]:
+    """The name of each format, and frames of it."""
+    water = np.random.default_rng(0).normal(12.0, 1.0, (camera.height, camera.width))
+    for number, name in enumerate(_FORMATS):
+        pictures = (_picture(water, _view(station, camera, k)) for k in range(_FRAMES))
+        yield name, (_frame(name, 100 * number + k, picture) for k, picture in enumerate(pictures))
+
+
+def _frame(name: str, number: int, picture: Array) -> Frame:
+    """A picture in one of the formats; numbers of two formats are too far apart for history to be carried across."""
+    encoding, white = _FORMATS[name]
+    image = np.clip(picture * (white / 255.0), 0, white).astype(np.uint8 if white == 255 else np.uint16)
+    pixels = np.repeat(image[:, :, None], 3, axis=2) if encoding == "bgr8" else image
+    return Frame(f"{name} {number}", number * _STEP_NS, pixels, encoding=encoding)
+
+
+def _view(station: Station, camera: Camera, k: int) -> Array:
+    """Pixels (n, 2) of the station's lights, head-on and a step nearer each frame; none in the blank one."""
+    if k == _BLANK:
+        return np.empty((0, 2))
+    T_dock_cam = np.diag([1.0, -1.0, -1.0, 1.0])
+    width = float(np.ptp(station.p_dock[:, :2], axis=0).max())
+    T_dock_cam[:2, 3] = station.p_dock[:, :2].mean(axis=0)
+    T_dock_cam[2, 3] = station.p_dock[:, 2].max() + (_AWAY - _STEP * k) * width
+    uv = camera.project(transform_points(se3_inverse(T_dock_cam), station.p_dock))
+    return uv[np.isfinite(uv).all(axis=1)]
+
+
+def _picture(water: Array, uv: Array) -> Array:
+    """Levels (H, W), white 255, of spots in `water`."""
+    image = water.copy()
+    for u, v in uv:
+        _add_blob(image, float(u), float(v))
+    return image
+
+
+def _add_blob(image: Array, u: float, v: float) -> None:
+    rows, columns = np.arange(int(v) - 8, int(v) + 9), np.arange(int(u) - 8, int(u) + 9)
+    if rows[0] >= 0 and rows[-1] < image.shape[0] and columns[0] >= 0 and columns[-1] < image.shape[1]:
+        profile = np.exp(-0.5 * ((rows[:, None] - v) ** 2 + (columns[None] - u) ** 2) / 2.25)
+        image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += 150.0 * profile

@@ -1,0 +1,1 @@
+"""A run or a campaign against the truth: errors, availability, claims, counts."""

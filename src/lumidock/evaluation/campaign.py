@@ -1,0 +1,333 @@
+"""A campaign: scenarios x seeds x methods through the light door, counted.
+
+A shard is one scenario, one method and a block of seeds. Its counts land in a file of its own as soon as they are
+there, so that a campaign that was cut short goes on where it was. What a table says does not depend on how many workers
+there were: counts and histograms are of integers, and shards are added up in their order.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+from multiprocessing import get_context, parent_process
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from lumidock.camera import Camera, load_camera
+from lumidock.config import Config
+from lumidock.errors import InputError, LumidockError
+from lumidock.evaluation.campaign_table import markdown, row_of
+from lumidock.evaluation.counts import Run, Tally, tally_run
+from lumidock.evaluation.cramer_rao import Bound
+from lumidock.methods import Method, localizer_of
+from lumidock.sim.detections import SimulatedFrame, simulated_frames
+from lumidock.sim.scenario import Scenario
+from lumidock.station import Station, load_station
+from lumidock.yamlfile import validate
+
+_SEEDS_PER_SHARD = 5
+_MAX_POOLS = 4  # a worker that dies takes its pool with it; the shards that are left get so many in all
+Progress = Callable[[int, int | None], None]
+
+
+# Shards
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shard:
+    """One scenario, one method and the seeds `first` to `stop` - 1; `key` stands for all that its counts depend on."""
+
+    scenario: Scenario
+    config: Config
+    method: str
+    cold: bool
+    first: int
+    stop: int
+    station: Station
+    camera: Camera
+    key: str
+    bound: bool = False
+
+    @property
+    def file(self) -> str:
+        """Name of the file with its counts."""
+        name = re.sub(r"\W+", "-", f"{self.scenario.name}-{self.method}")
+        return f"{name}-{self.first}-{self.stop}-{self.key}.json"
+
+
+def run_shard(shard: Shard) -> dict[str, Any]:
+    """Counts of one shard, and the seconds that it took; made in a worker."""
+    cv2.setNumThreads(1)
+    start, tally = time.perf_counter(), Tally()
+    localizer = localizer_of(shard.method, shard.station, shard.camera, shard.config, cold=shard.cold)
+    for seed in range(shard.first, shard.stop):
+        tally.merge(tally_run(run_seed(shard, localizer, seed)))
+    return {"key": shard.key, "tally": tally.as_dict(), "seconds": time.perf_counter() - start}
+
+
+def run_seed(shard: Shard, localizer: Method, seed: int) -> Run:
+    """One seed through the light door; a sequence begins without history."""
+    frames = list(simulated_frames(shard.scenario, shard.station, shard.camera, seed))
+    fixes = []
+    for frame in frames:
+        if frame.step == 0:
+            localizer.forget()
+        fixes.append(localizer.process_detections(frame.detections))
+    return Run(shard.scenario, seed, frames, fixes, _owed(shard, frames) if shard.bound else None)
+
+
+def _owed(shard: Shard, frames: Sequence[SimulatedFrame]) -> np.ndarray:
+    """In which frames (N,) the bound of what is possible owes a valid fix."""
+    bound = Bound(shard.station, shard.camera, shard.config, cold=shard.cold)
+    owed = np.zeros(len(frames), bool)
+    for k, frame in enumerate(frames):
+        if frame.step == 0:
+            bound.forget()
+        lights = frame.light[frame.light >= 0]
+        owed[k] = bound.owes(frame.detections.t_ns, frame.T_dock_cam, lights)
+    return owed
+
+
+# A campaign
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Campaign:
+    """What was asked for: shards in the order of the table, and an `identity` that is equal for equal requests."""
+
+    shards: Sequence[Shard]
+    identity: dict[str, Any]
+
+
+def plan(
+    scenarios: Sequence[Scenario],
+    methods: Sequence[str],
+    seeds: tuple[int, int],
+    station_file: Path,
+    camera_file: Path,
+    *,
+    cold: bool = False,
+    bound: bool = False,
+) -> Campaign:
+    """Cut scenarios x methods x the seeds from `seeds[0]` to before `seeds[1]` into shards. Raises: InputError."""
+    station, camera = load_station(station_file), load_camera(camera_file)
+    inputs = {path.name: _digest(path.read_bytes()) for path in (station_file, camera_file)}
+    shared = {"lumidock": f"{version('lumidock')}+{source_digest()}", "inputs": inputs, "cold": cold, "bound": bound}
+    shards = []
+    for scenario in dict.fromkeys(scenario.model_dump_json() for scenario in scenarios):
+        parsed = Scenario.model_validate_json(scenario)
+        config = validate(Config, parsed.config, f"{parsed.name}: config")
+        for method in dict.fromkeys(methods):
+            what = shared | {"scenario": scenario, "config": config.model_dump_json(), "method": method}
+            for first, stop in _blocks(seeds):
+                key = _digest(json.dumps(what | {"seeds": [first, stop]}).encode())[:16]
+                shards.append(Shard(parsed, config, method, cold, first, stop, station, camera, key, bound))
+    identity = shared | {
+        "scenarios": [scenario.model_dump(mode="json") for scenario in scenarios],
+        "methods": list(methods),
+        "seeds": list(seeds),
+        "shards": [shard.file for shard in shards],
+    }
+    return Campaign(shards, identity)
+
+
+def _blocks(seeds: tuple[int, int]) -> Iterator[tuple[int, int]]:
+    """Blocks of seeds; they begin at multiples, so that a longer campaign has the blocks of a shorter one."""
+    first = seeds[0]
+    while first < seeds[1]:
+        stop = min(first - first % _SEEDS_PER_SHARD + _SEEDS_PER_SHARD, seeds[1])
+        yield first, stop
+        first = stop
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+@cache
+def source_digest() -> str:
+    """Of all source of the package and its measured tables: counts are not mixed between versions of it."""
+    digest = hashlib.sha256()
+    package = Path(__file__).parents[1]
+    for path in sorted((*package.rglob("*.py"), *package.rglob("*.json"))):
+        digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def prepare(campaign: Campaign, out: Path, *, force: bool = False) -> None:
+    """Make the folder of a campaign, or take up the same one again.
+
+    With `force` a folder that holds something else is taken over; shards that this campaign has too are kept.
+    Raises: InputError.
+    """
+    described = out / "campaign.json"
+    before = read_json(described)
+    if before != campaign.identity:
+        if out.exists() and not out.is_dir():
+            raise InputError(f"{out}: is a file")
+        if out.exists() and any(out.iterdir()) and not force:
+            what = "is of another campaign" if before else "exists"
+            raise InputError(f"{out}: {what}; give --force to write into it")
+    (out / "shards").mkdir(parents=True, exist_ok=True)
+    wanted = set(campaign.identity["shards"])
+    for path in (out / "shards").glob("*.json*"):
+        if path.name not in wanted:
+            path.unlink()
+    write_whole(described, json.dumps(campaign.identity, indent=1))
+
+
+def run_campaign(
+    campaign: Campaign,
+    out: Path,
+    *,
+    workers: int | None = None,
+    cluster: str | None = None,
+    progress: Progress = lambda _done, _total: None,
+) -> float:
+    """Run all shards that have no file in `out` yet; returns frames per second and core, NaN where all were there.
+
+    Over `workers` processes (by default one for each core; 0: in this one), or on the dask cluster at the address
+    `cluster`. Raises: InputError; LumidockError when workers keep dying.
+    """
+    todo = {shard.file: shard for shard in campaign.shards if _read_shard(out, shard) is None}
+    total, frames, seconds = len(campaign.shards), 0, 0.0
+    progress(total - len(todo), total)
+    workers = os.cpu_count() or 1 if workers is None else workers
+    for shard, result in _results(list(todo.values()), workers, cluster):
+        write_whole(out / "shards" / shard.file, json.dumps(result))
+        del todo[shard.file]
+        frames, seconds = frames + result["tally"]["counts"]["frames"], seconds + result["seconds"]
+        progress(total - len(todo), total)
+    return frames / seconds if seconds else float("nan")
+
+
+def _results(shards: list[Shard], workers: int, cluster: str | None) -> Iterator[tuple[Shard, dict[str, Any]]]:
+    """Counts of shards as they come; when a worker dies, what is left goes to new ones."""
+    if cluster is None and not workers:
+        yield from ((shard, run_shard(shard)) for shard in shards)
+        return
+    left = {shard.file: shard for shard in shards}
+    for _ in range(_MAX_POOLS):
+        with worker_pool(workers, cluster) as pool:
+            for shard, result in _pooled(pool, list(left.values())):
+                del left[shard.file]
+                yield shard, result
+        if not left:
+            return
+    raise LumidockError(f"workers died {_MAX_POOLS} times; {len(left)} shards are left")
+
+
+def _pooled(pool: Executor, shards: list[Shard]) -> Iterator[tuple[Shard, dict[str, Any]]]:
+    """Counts of shards as they come, but of those that a dead worker had."""
+    futures: dict[Future[dict[str, Any]], Shard] = {}
+    try:
+        for shard in shards:
+            futures[pool.submit(run_shard, shard)] = shard
+    except BrokenProcessPool:
+        pass  # those that were given out say so too
+    for future in as_completed(futures):
+        try:
+            result = future.result()
+        except Exception as error:
+            if not _worker_died(error):
+                raise
+        else:
+            yield futures[future], result
+
+
+def _worker_died(error: Exception) -> bool:
+    """Whether it was the worker; dask's own error is known by its name, since dask need not be there."""
+    return isinstance(error, (BrokenProcessPool, CancelledError)) or type(error).__name__ == "KilledWorker"
+
+
+@contextmanager
+def worker_pool(workers: int, cluster: str | None) -> Iterator[Executor]:
+    """Worker processes here, or those of a dask cluster."""
+    if cluster is not None:
+        with _dask_client(cluster) as client:
+            yield client.get_executor()
+        return
+    spawn = get_context("spawn")  # a fork would inherit the locks of OpenCV's threads
+    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=_start_worker) as pool:
+        try:
+            yield pool
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _dask_client(address: str) -> Any:  # noqa: ANN401
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("--cluster needs dask distributed: pip install 'lumidock[cluster]'") from None
+    try:
+        return Client(address, timeout="10s", set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"--cluster {address}: {error or type(error).__name__}") from None
+
+
+def _start_worker() -> None:
+    """Let Ctrl-C end a worker without a word, and the end of the parent too."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _read_shard(out: Path, shard: Shard) -> dict[str, Any] | None:
+    """The counts of a shard that was finished before."""
+    content = read_json(out / "shards" / shard.file)
+    return content if content and content.get("key") == shard.key else None
+
+
+def read_json(path: Path) -> dict[str, Any] | None:
+    """The mapping in a JSON file; None where there is none."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file so that it is there whole or not at all."""
+    partial = path.with_name(f"{path.name}.tmp")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)
+
+
+def tabulate(campaign: Campaign, out: Path) -> dict[str, Any]:
+    """Add up all shards in their order, and write table.json and table.md. Raises: LumidockError for a missing one."""
+    tallies: dict[tuple[str, str], Tally] = {}
+    for shard in campaign.shards:
+        content = _read_shard(out, shard)
+        if content is None:
+            raise LumidockError(f"{out / 'shards' / shard.file}: is not there")
+        place = (shard.scenario.model_dump_json(), shard.method)
+        tallies.setdefault(place, Tally()).merge(Tally.from_dict(content["tally"]))
+    names = {shard.scenario.model_dump_json(): shard.scenario.name for shard in campaign.shards}
+    rows = [{"scenario": names[key], "method": method} | row_of(tally) for (key, method), tally in tallies.items()]
+    table = {name: campaign.identity[name] for name in ("lumidock", "inputs", "cold", "seeds")} | {"rows": rows}
+    write_whole(out / "table.json", json.dumps(table, indent=1))
+    write_whole(out / "table.md", markdown(table))
+    return table

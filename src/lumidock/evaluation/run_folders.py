@@ -1,0 +1,120 @@
+"""Run folders as such: what one was made with and from, and the evaluation of many as one table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from lumidock.errors import InputError, extra
+from lumidock.evaluation.metrics import evaluate
+from lumidock.streams.run_folder import identities
+from lumidock.streams.sources import Source, open_source
+
+_PARTS = ("source", "inputs_sha256", "inputs_sampled", "config", "counts")
+_MOST_DEEP = 4  # folders below the given one in which runs are looked for
+
+
+def described(folder: Path) -> dict[str, Any]:
+    """The run.json of a run folder. Raises: InputError, one line."""
+    path = folder / "run.json"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+    if not isinstance(content, dict) or not all(isinstance(content.get(part, {}), dict) for part in _PARTS):
+        raise InputError(f"{path}: not the description of a run")
+    return content
+
+
+def source_of(folder: Path, description: Mapping[str, Any], given: Path | None = None) -> Source | None:
+    """The source of a run, by its hashes: the one given, or a sequence folder of its name in or beside the run.
+
+    Raises: InputError for one that is given and that the run was not made from.
+    """
+    if given is not None:
+        opened = open_source(given)
+        if not _is_source(opened, description):
+            raise InputError(f"{given}: not what {folder} was made from")
+        return opened
+    name = Path(str(description.get("source", {}).get("name", ""))).name or "sequence"
+    for place in (folder / name, folder.parent / name):
+        if (place / "timestamps.csv").is_file():
+            opened = open_source(place)
+            if _is_source(opened, description):
+                return opened
+    return None
+
+
+def _is_source(source: Source, description: Mapping[str, Any]) -> bool:
+    """Whether the files that identify a source are those of the run."""
+    found = identities({path.name: path for path in source.inputs})
+    return all(
+        description.get(part, {}).get(name) == value for part, values in found.items() for name, value in values.items()
+    )
+
+
+def find_runs(folder: Path) -> list[Path]:
+    """The run folder itself, or all run folders below it in the order of their names. Raises: InputError for none."""
+    if (folder / "fixes.csv").is_file():
+        return [folder]
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    runs = sorted(_below(folder, _MOST_DEEP))
+    if not runs:
+        raise InputError(f"{folder}: neither a run nor a folder with runs")
+    return runs
+
+
+def _below(folder: Path, deep: int) -> Iterator[Path]:
+    for inner in folder.iterdir():
+        if (inner / "fixes.csv").is_file():
+            yield inner
+        elif deep > 1 and inner.is_dir() and not inner.is_symlink():
+            yield from _below(inner, deep - 1)
+
+
+def evaluate_all(folder: Path, truth: Path | None = None) -> list[dict[str, Any]]:
+    """The evaluation of every run below `folder`, with its `run` (name), `method` and `latency_us`.
+
+    Against `truth`, or the sequence that is found in or beside each run. Raises: InputError for a run without truth.
+    """
+    rows = []
+    for run in find_runs(folder):
+        description = described(run)
+        name = str(run.relative_to(folder)) if run != folder else run.resolve().name
+        about = {"run": name, "method": description.get("method"), "cold": description.get("cold")}
+        latency = {"latency_us": description.get("counts", {}).get("latency_us", {})}
+        rows.append(about | evaluate(run, truth or _truth_beside(run, description)) | latency)
+    return rows
+
+
+def _truth_beside(run: Path, description: Mapping[str, Any]) -> Path:
+    source = source_of(run, description)
+    if source is None or not (source.path / "truth.csv").is_file():
+        raise InputError(f"{run}: no truth in or beside it; give TRUTH")
+    return source.path
+
+
+def flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested content as one row: `error.lateral_m.median` and so on; lists are left out."""
+    row: dict[str, Any] = {}
+    for name, value in content.items():
+        if isinstance(value, Mapping):
+            row |= flat(value, f"{prefix}{name}.")
+        elif not isinstance(value, list):
+            row[f"{prefix}{name}"] = value
+    return row
+
+
+def write_table(rows: list[dict[str, Any]], path: Path) -> None:
+    """Write evaluations, a row a run, as .parquet or .json by the ending. Raises: InputError for another ending."""
+    if path.suffix == ".json":
+        path.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    elif path.suffix == ".parquet":
+        with extra("parquet"):
+            from lumidock.streams.parquet import write_rows
+        write_rows([flat(row) for row in rows], path)
+    else:
+        raise InputError(f"{path}: neither .parquet nor .json")

@@ -1,0 +1,1 @@
+"""A user's own dock and camera: calibration files."""

@@ -1,0 +1,121 @@
+"""Where fixes go besides the run folder: a sink is opened by the name of its file or address."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from lumidock.camera import Camera
+from lumidock.datatypes import Detections, Fix, Frame, Image, Unusable
+from lumidock.errors import InputError, extra
+from lumidock.picture import developed
+from lumidock.station import Station
+from lumidock.streams.overlay import draw, whole
+from lumidock.streams.run_folder import RunFolder
+from lumidock.streams.vehicle import Vehicle
+
+FILE_KINDS = (".mcap", ".rrd", ".mp4")
+_WIDTH = 1224  # of an annotated video, px
+
+
+class Sink(Protocol):
+    """Takes one frame and its fix after the other."""
+
+    def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
+        """Take one frame. Raises: OSError when it cannot."""
+        ...
+
+    def close(self) -> None:
+        """Write what is left."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What every sink needs to know beside the fixes."""
+
+    station: Station
+    camera: Camera
+    vehicle: Vehicle | None = None
+
+
+def open_file_sink(path: Path, scene: Scene) -> Sink:
+    """A sink that writes `path`, whose ending says what it becomes. Raises: InputError for another ending."""
+    if path.suffix == ".mcap":
+        with extra("bag"):
+            from lumidock.streams.mcapfile import McapFile
+        return McapFile(path, scene.camera, scene.vehicle, scene.station.ids)
+    if path.suffix == ".rrd":
+        return open_rerun(str(path), scene)
+    if path.suffix == ".mp4":
+        with extra("video"):
+            from lumidock.streams.mp4 import Mp4
+        return _AnnotatedVideo(Mp4(path), scene)
+    raise InputError(f"{path}: not one of {', '.join(FILE_KINDS)}")
+
+
+def open_rerun(target: str, scene: Scene) -> Sink:
+    """A Rerun file, or the viewer at rerun+http://HOST:PORT/proxy."""
+    with extra("rerun"):
+        from lumidock.streams.rerunlog import RerunLog
+    return RerunLog(target, scene.station, scene.camera)
+
+
+class RunSink:
+    """A run folder as a sink, started once; what could not be written, on a full disk, is missing as whole rows."""
+
+    def __init__(self, folder: Path, light_ids: tuple[str, ...]) -> None:
+        self._folder = RunFolder(folder, light_ids)
+        self._folder.describe({"lumidock": version("lumidock"), "live": True})
+
+    def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
+        """Append one frame."""
+        self._folder.add(fix, latency_us, t_ns=item.t_ns)
+
+    def close(self) -> None:
+        """Nothing is held back, so there is nothing to do."""
+
+
+class Numbered:
+    """Opens FILE, and after a failure FILE-1, FILE-2, ..., so that what was written stays."""
+
+    def __init__(self, path: Path, scene: Scene) -> None:
+        self._path, self._scene, self._number, self._opened = path, scene, 0, False
+
+    def open(self) -> Sink:
+        """A sink of the first file that was not written to before."""
+        current = self._current()
+        self._number += self._opened and current.exists() and current.stat().st_size > 0
+        self._opened = True
+        return open_file_sink(self._current(), self._scene)
+
+    def _current(self) -> Path:
+        return self._path.with_stem(f"{self._path.stem}-{self._number}") if self._number else self._path
+
+
+class _Pictures(Protocol):
+    def add(self, picture: Image, t_ns: int) -> None: ...
+
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class _AnnotatedVideo:
+    video: _Pictures
+    scene: Scene
+
+    def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
+        """Draw one fix; frames without a picture leave the last one standing."""
+        del latency_us
+        if isinstance(item, Frame):
+            image = developed(item)
+            view = whole(image, min(_WIDTH, image.shape[1]))
+            picture = draw(image, fix, self.scene.station, self.scene.camera, view)
+            self.video.add(np.asarray(picture, np.uint8), item.t_ns)
+
+    def close(self) -> None:
+        self.video.close()

@@ -1,0 +1,140 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from conftest import assert_close
+
+from lumidock.camera import load_camera
+from lumidock.cli.shared import shipped_or_path
+from lumidock.config import Config
+from lumidock.evaluation.station_check import Limits, inspect_station, visible_lights
+from lumidock.station import load_station
+
+LIMITS = Limits(1.5, 4, 20.0)
+CAGE = shipped_or_path("station", "cage-2x2x5")
+LENS = load_camera(shipped_or_path("camera", "imx264-60deg"))
+
+
+def dock(path, positions, layer="front", **more):
+    lights = [{"id": f"L{i}", "layer": layer, "position": list(map(float, p))} | more for i, p in enumerate(positions)]
+    path.write_text(yaml.safe_dump({"schema": 1, "name": "made", "lights": lights}))
+    return load_station(path)
+
+
+def head_on(z):
+    T = np.diag([1.0, -1, -1, 1])
+    T[2, 3] = z
+    return T
+
+
+def test_lights_are_seen_inside_the_picture_and_their_beams(tmp_path):
+    station = dock(tmp_path / "a.yaml", [[0, 0, 0], [1, 0, 0], [0, 1, 0], [20, 0, 0]], beam_deg=60.0)
+    assert visible_lights(station, LENS, head_on(10.0)).tolist() == [0, 1, 2]
+    assert visible_lights(station, LENS, head_on(1.0)).tolist() == [0]  # the others shine past the camera
+    assert visible_lights(station, LENS, head_on(-1.0)).tolist() == []
+
+
+def test_the_shipped_cage_passes_and_its_levels_are_those_of_the_lights():
+    result = inspect_station(load_station(CAGE), LENS, Config(), LIMITS)
+    assert result["failed"] == []
+    assert result["layers"] == {"front": 7, "rear": 6}
+    rows = {row["z_m"]: row for row in result["corridor"]}
+    assert rows[18]["lights"] == {"front": 7, "rear": 6}
+    assert (rows[18]["stage"], rows[-1]["stage"]) == ("transition", "rear")
+    assert rows[3]["lateral_m"] < rows[10]["lateral_m"] < rows[30]["lateral_m"]
+    four = next(row for row in result["confusions"] if (row["layer"], row["seen"]) == ("front", 4))
+    assert_close(four["naming_px"], four["naming_m"] * 2087.0 / 18.0, atol=0.1)
+
+
+def test_a_square_of_lights_fails_for_its_mirror_image(tmp_path):
+    station = dock(tmp_path / "a.yaml", [[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
+    failed = inspect_station(station, LENS, Config(), LIMITS)["failed"]
+    assert any("mirror image of 4 lights fits within 0.00 px" in text for text in failed)
+
+
+def test_a_wide_dock_goes_dark_up_close(tmp_path):
+    wide = [[3, 2.7, 0], [-3, 2.2, 0], [-2.6, -2.4, 0], [3.1, -1.9, 0], [0.7, 2.9, 0]]
+    failed = inspect_station(dock(tmp_path / "a.yaml", wide), LENS, Config(), LIMITS)["failed"]
+    assert any("fewer than 4 lights" in text and " 1.5" in text for text in failed)
+
+
+def test_many_lights_are_looked_at_in_bounded_time(tmp_path):
+    rng = np.random.default_rng(4)
+    station = dock(tmp_path / "a.yaml", np.column_stack([rng.uniform(-1, 1, (30, 2)), np.zeros(30)]))
+    rows = inspect_station(station, LENS, Config(), LIMITS)["confusions"]
+    assert rows[-1]["naming_m"] is None
+
+
+def test_the_command_draws_and_its_exit_code_serves_a_build(lumidock, tmp_path):
+    code, out, err = lumidock("station", "check", CAGE, "--picture", tmp_path / "dock.png")
+    assert (code, err) == (0, "")
+    assert "all checks passed" in out
+    assert cv2.imread(str(tmp_path / "dock.png")).shape[0] > 400
+    dock(tmp_path / "a.yaml", [[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
+    code, out, err = lumidock("station", "check", tmp_path / "a.yaml", "--json")
+    assert (code, err) == (1, "")
+    assert json.loads(out)["failed"]
+
+
+# The machine and the settings
+
+
+def test_doctor_names_every_extra(lumidock):
+    code, out, err = lumidock("doctor", "--json")
+    assert (code, err) == (0, "")
+    found = {finding["what"]: finding for finding in json.loads(out)}
+    assert all(found[f"[{name}]"]["mark"] == "ok" for name in ("bag", "video", "mavlink", "zenoh", "live", "rerun"))
+    assert found["Python"]["mark"] == "ok"
+
+
+def test_doctor_says_what_is_in_the_way(monkeypatch, tmp_path):
+    import socket
+
+    from lumidock.app import doctor
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        assert doctor._port("page", taken.getsockname()[1]).mark == "note"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    assert doctor._caches().mark == "note"
+    monkeypatch.setattr("os.access", lambda *_: False)
+    assert doctor._caches().mark == "bad"
+    monkeypatch.setattr("time.time", lambda: 5.0)
+    assert doctor._clock().mark == "bad"
+    assert "lumidock[none]" in doctor._extra("none", ("no_such_module",)).text
+
+
+def test_what_config_dumps_is_a_config(lumidock, tmp_path):
+    code, out, err = lumidock("config", "dump")
+    assert (code, err) == (0, "")
+    (tmp_path / "all.yaml").write_text(out)
+    assert lumidock("config", "dump", "--config", tmp_path / "all.yaml") == (0, out, "")
+    (tmp_path / "one.yaml").write_text("match: {noise_px: 0.75}\n")
+    changed = yaml.safe_load(lumidock("config", "dump", "--config", tmp_path / "one.yaml")[1])
+    assert changed["match"]["noise_px"] == 0.75
+    schema = json.loads(lumidock("config", "schema")[1])
+    assert "match" in schema["properties"]
+
+
+COMMANDS = (
+    *(("run",), ("sim",), ("eval",), ("campaign",), ("demo",), ("inspect",), ("export",), ("serve",), ("doctor",)),
+    *(("calib", "import"), ("calib", "export"), ("calib", "check"), ("station", "check")),
+    *(("config", "dump"), ("config", "schema")),
+)
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_help_has_examples_that_name_the_command(lumidock, command):
+    code, out, err = lumidock(*command, "--help")
+    assert (code, err) == (0, "")
+    assert f"lumidock {' '.join(command)}" in out.split("Examples:")[1]
+
+
+def test_the_shell_completes_commands(lumidock, monkeypatch):
+    monkeypatch.setenv("_LUMIDOCK_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", "lumidock ins")
+    monkeypatch.setenv("COMP_CWORD", "1")
+    assert lumidock()[1].split() == ["inspect"]
