@@ -30,7 +30,7 @@ with tempfile.TemporaryDirectory() as folder:
     file = Path(folder) / "dock.yaml"
     file.write_text(yaml.safe_dump(content))
     station = load_station(file)
-camera = load_camera(Path(__file__).parents[1] / "cameras" / "imx264-60deg.yaml")
+camera = load_camera(Path(__file__).parents[1] / "src" / "lumidock" / "cameras" / "imx264-60deg.yaml")
 
 T_dock_cam = np.diag([1.0, -1.0, -1.0, 1.0])  # head-on
 T_dock_cam[:3, 3] = 0.3, -0.2, 6.0

@@ -18,8 +18,8 @@ from lumidock.station import load_station
 from lumidock.track import NO_PLANE, Track
 
 ROOT = Path(__file__).parents[1]
-STATION = load_station(ROOT / "stations" / "cage-2x2x5.yaml")
-CAMERA = load_camera(ROOT / "cameras" / "imx264-60deg.yaml")
+STATION = load_station(ROOT / "src" / "lumidock" / "stations" / "cage-2x2x5.yaml")
+CAMERA = load_camera(ROOT / "src" / "lumidock" / "cameras" / "imx264-60deg.yaml")
 PLAN = match.plan(STATION, CAMERA, Config().match)
 M = len(STATION)
 

@@ -20,8 +20,8 @@ from lumidock.sim.scenario import load_scenario
 from lumidock.station import Station, load_station
 
 ROOT = Path(__file__).parents[1]
-STATION = load_station(ROOT / "stations" / "cage-2x2x5.yaml")
-CAMERA = load_camera(ROOT / "cameras" / "imx264-60deg.yaml")
+STATION = load_station(ROOT / "src" / "lumidock" / "stations" / "cage-2x2x5.yaml")
+CAMERA = load_camera(ROOT / "src" / "lumidock" / "cameras" / "imx264-60deg.yaml")
 HEAD_ON = np.diag([1.0, -1.0, -1.0])
 STEP_NS = 66_666_700
 

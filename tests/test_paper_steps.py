@@ -38,7 +38,7 @@ def test_swarm_names_the_lights_of_a_shifted_scaled_rolled_view(rng, seen):
         assert register(view, FRONT, None, PsoConfig(), rng).light.tolist() == order.tolist()
 
 
-@pytest.mark.parametrize("strays", [1, 2])
+@pytest.mark.parametrize("spurious", [1, 2])
 def test_swarm_leaves_strays_without_a_name(rng, spurious):
     view = similarity(FRONT, 0.05, 100.0, np.array([20.0, -30.0]))
     view = np.concatenate([view, rng.uniform(-300, 300, (spurious, 2))])

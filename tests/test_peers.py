@@ -233,7 +233,7 @@ def test_ros_parses_our_camera_info(tmp_path):
 
 
 def test_opencv_reads_our_calibration(tmp_path):
-    camera = load_camera(Path(__file__).parents[1] / "cameras" / "imx264-60deg.yaml")
+    camera = load_camera(Path(__file__).parents[1] / "src" / "lumidock" / "cameras" / "imx264-60deg.yaml")
     write_calibration(camera, tmp_path / "cv.yaml", "opencv")
     storage = cv2.FileStorage(str(tmp_path / "cv.yaml"), cv2.FILE_STORAGE_READ)
     assert_close(storage.getNode("camera_matrix").mat(), camera.K)

@@ -112,8 +112,8 @@ def test_reprojection_rms_is_in_pixels(camera, T_dock_cam):
     assert_close(reprojection_rms_px(camera, T_dock_cam, DEEP, one_off), 6.0 / np.sqrt(len(DEEP)))
 
 
-STATION = load_station(ROOT / "stations" / "cage-2x2x5.yaml")
-CAMERA = load_camera(ROOT / "cameras" / "imx264-60deg.yaml")
+STATION = load_station(ROOT / "src" / "lumidock" / "stations" / "cage-2x2x5.yaml")
+CAMERA = load_camera(ROOT / "src" / "lumidock" / "cameras" / "imx264-60deg.yaml")
 FRONT, ALL = np.arange(7), np.arange(13)
 
 

@@ -15,8 +15,8 @@ from lumidock.sim.scenario import load_scenario
 from lumidock.station import load_station
 
 ROOT = Path(__file__).parents[1]
-STATION = load_station(ROOT / "stations" / "cage-2x2x5.yaml")
-CAMERA = load_camera(ROOT / "cameras" / "imx264-60deg.yaml")
+STATION = load_station(ROOT / "src" / "lumidock" / "stations" / "cage-2x2x5.yaml")
+CAMERA = load_camera(ROOT / "src" / "lumidock" / "cameras" / "imx264-60deg.yaml")
 CONFIG = Config()
 PLAN = match.plan(STATION, CAMERA, CONFIG.match)
 M = len(STATION)
