@@ -13,6 +13,7 @@ from lumidock import match
 from lumidock.config import Config
 from lumidock.datatypes import Detections
 from lumidock.localizer import Localizer
+from lumidock.model import attitude_prior, measurements, station_model
 from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import load_scenario
 
@@ -29,12 +30,12 @@ _COLD = {
 def cold_ms(scenario: str, settings: tuple[str, ...]) -> np.ndarray:
     """Milliseconds (N,) of `match.acquire` on each of some frames of a scenario."""
     station, camera, config = shipped_station(), shipped_camera(), Config()
-    plan, expected = match.plan(station, camera, config.match), match.prior(None, config.prior)
+    model, expected = station_model(station, camera, config.match), attitude_prior(None, config.prior)
     times = []
     for frame in islice(simulated_frames(load_scenario(scenario, settings), station, camera, _SEED), _FRAMES):
         start = time.perf_counter()
-        found = match.detections(frame.detections, plan, config.match)
-        match.acquire(found, plan, camera, expected, config.match)
+        found = measurements(frame.detections, model, config.match)
+        match.acquire(found, model, camera, expected, config.match)
         times.append(1e3 * (time.perf_counter() - start))
     return np.array(times[1:])
 

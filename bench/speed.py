@@ -25,6 +25,7 @@ from lumidock import detect, layers, match
 from lumidock.config import Config
 from lumidock.datatypes import Detections, Frame
 from lumidock.localizer import Localizer
+from lumidock.model import attitude_prior, measurements, station_model
 from lumidock.paper import PaperLocalizer
 from lumidock.station import Station
 from lumidock.streams.sources import open_source
@@ -73,7 +74,7 @@ def lumidock_round(times: Times, frames: list[Frame]) -> None:
         layers.label(frame, detect.lights(frame, config.detect, scan, expected), config.label)
 
     for frame in frames:
-        expected = localizer.foreseen(frame)
+        expected = localizer.search_windows(frame)
         if expected is None:
             timed(times, "full search", lambda f=frame: find(f, full, None))
             timed(times, "full search to fix", lambda f=frame: localizer.process(f))
@@ -126,20 +127,18 @@ def matching_growth(lights: tuple[int, ...], spurious: tuple[int, ...]) -> dict[
     grown: dict[int, dict[int, tuple[float, float]]] = {m: {} for m in lights}
     for m in lights:
         station = dense_station(m, rng)
-        plan, expected = match.plan(station, camera, config.match), match.prior(None, config.prior)
+        model, expected = station_model(station, camera, config.match), attitude_prior(None, config.prior)
         uv = camera.project(station.p_dock * (1.0, -1.0, -1.0) + (0.2, 0.1, 9.0))
         for count in spurious:
             times: Times = defaultdict(list)
             for turn in range(_DRAWS + 1):
                 shown = (uv + rng.normal(0.0, 0.3, (m, 2)))[rng.random(m) < 0.9]
                 spurious = rng.uniform((0.0, 0.0), (camera.width, camera.height), (count, 2))
-                found = match.detections(
-                    Detections.from_uv("0", 0, np.concatenate([shown, spurious])), plan, config.match
-                )
+                found = measurements(Detections.from_uv("0", 0, np.concatenate([shown, spurious])), model, config.match)
                 timed(
                     times if turn else defaultdict(list),
                     "match",
-                    lambda f=found, p=plan, e=expected: match.acquire(f, p, camera, e, config.match),
+                    lambda f=found, p=model, e=expected: match.acquire(f, p, camera, e, config.match),
                 )
             grown[m][count] = float(np.median(times["match"])), max(times["match"])
     return grown

@@ -7,33 +7,36 @@ import pytest
 from conftest import assert_close
 from scipy.stats import chi
 
-from lumidock import integrity, match, track
+from lumidock import integrity, track
+from lumidock._kernels.tracking.track import FilterState
 from lumidock.camera import load_camera
 from lumidock.config import Config, IntegrityConfig
 from lumidock.datatypes import Guide, Protection
 from lumidock.evaluation import claims
 from lumidock.geometry import bearing_and_range, se3_exp, se3_inverse
 from lumidock.integrity import Bounds, alert_limit, alert_limits, bounds, guide_holds, pose_holds, sigma_factors
+from lumidock.model import station_model
 from lumidock.station import load_station
-from lumidock.track import NO_PLANE, Track
+from lumidock.track import NO_PLANE, FrameResult, LastSeen, Track
 
 ROOT = Path(__file__).parents[1]
 STATION = load_station(ROOT / "src" / "lumidock" / "stations" / "cage-2x2x5.yaml")
 CAMERA = load_camera(ROOT / "src" / "lumidock" / "cameras" / "imx264-60deg.yaml")
-PLAN = match.plan(STATION, CAMERA, Config().match)
+MODEL = station_model(STATION, CAMERA, Config().match)
 M = len(STATION)
 
 
-def belief(T_dock_cam, P6, *, lights=4, log_weight=0.0, apart=None):
+def hypothesis(T_dock_cam, P6, *, lights=4, log_weight=0.0, apart=None):
     """A track that holds `T_dock_cam` possible with the pose covariance `P6` (6, 6)."""
     T_cam_dock = se3_inverse(T_dock_cam)
-    x, P = track.slow_states(STATION, None)
+    x, P = track.calibration_prior(STATION, None)
     P[:6, :6] = P6
     name = np.where(np.arange(M) < lights, np.arange(M), -1)
     apart = np.zeros((M, 18)) if apart is None else apart
     R, t = np.ascontiguousarray(T_cam_dock[:3, :3]), np.ascontiguousarray(T_cam_dock[:3, 3])
-    count = PLAN.count(name)
-    return Track(0, 0, R, t, x, P, False, log_weight, 2, 0, 0, (0, 0), name, count, apart, NO_PLANE, 1.0, 0.0, 0.0)
+    last = FrameResult(name, MODEL.count(name), apart, NO_PLANE, 1.0, 0.0)
+    seen, state = LastSeen(0, 0, (0, 0)), FilterState(R, t, x, P)
+    return Track(0, 0, state, seen, last, log_weight=log_weight, agreeing_frames=2)
 
 
 def at(z, rng=None):
@@ -99,7 +102,7 @@ def test_sigma_factors_are_those_of_the_chi_distribution(risk):
 def test_levels_hold_as_often_as_they_say(z_m, rng):
     risk, n = 0.02, 4000
     T_dock_cam, P6 = at(z_m, rng), covariance(rng)
-    bound = bounds([belief(T_dock_cam, P6)], IntegrityConfig(risk=risk))
+    bound = bounds([hypothesis(T_dock_cam, P6)], IntegrityConfig(risk=risk))
     draws = rng.multivariate_normal(np.zeros(6), P6, n)
     truths = [se3_inverse(se3_inverse(T_dock_cam) @ se3_exp(xi)) for xi in draws]
     over = np.mean([np.array(sizes(T_dock_cam, truth)) > levels_of(bound) for truth in truths], axis=0)
@@ -116,7 +119,7 @@ def test_levels_hold_as_often_as_they_say(z_m, rng):
 @pytest.mark.parametrize("place", [[0.0, 0.5, 0.08], [0.4, 0.01, 0.09], [0.02, 0.01, 0.0], [0.3, 0.02, -0.08]])
 def test_bearings_beside_the_origin_are_bounded(place, rng):
     T_cam_dock = se3_inverse(pose(place))
-    level = bounds([belief(pose(place), np.eye(6) * 0.02**2)], IntegrityConfig()).guide.pl_bearing_rad
+    level = bounds([hypothesis(pose(place), np.eye(6) * 0.02**2)], IntegrityConfig()).guide.pl_bearing_rad
     x, y, z = (T_cam_dock[:3, 3] + rng.normal(0.0, 0.02, (1_000_000, 3))).T
     off = [
         np.arctan2(a, z) - math.atan2(c, T_cam_dock[2, 3]) for a, c in ((x, T_cam_dock[0, 3]), (y, T_cam_dock[1, 3]))
@@ -126,7 +129,7 @@ def test_bearings_beside_the_origin_are_bounded(place, rng):
 
 def test_bounds_say_where_the_dock_is(rng):
     T_dock_cam = at(8.0, rng)
-    bound = bounds([belief(T_dock_cam, covariance(rng))], IntegrityConfig())
+    bound = bounds([hypothesis(T_dock_cam, covariance(rng))], IntegrityConfig())
     assert_close(bound.T_dock_cam, T_dock_cam, atol=1e-12)
     guide = bound.guide
     expected = bearing_and_range(T_dock_cam)
@@ -136,19 +139,19 @@ def test_bounds_say_where_the_dock_is(rng):
 def test_levels_rise_with_the_covariance_and_with_less_risk(rng):
     T_dock_cam, P6 = at(8.0, rng), covariance(rng)
     config = IntegrityConfig()
-    plain = levels_of(bounds([belief(T_dock_cam, P6)], config))
-    assert_close(levels_of(bounds([belief(T_dock_cam, 4.0 * P6)], config)), 2.0 * plain, rtol=1e-9)
+    plain = levels_of(bounds([hypothesis(T_dock_cam, P6)], config))
+    assert_close(levels_of(bounds([hypothesis(T_dock_cam, 4.0 * P6)], config)), 2.0 * plain, rtol=1e-9)
     more = covariance(rng)
-    assert (levels_of(bounds([belief(T_dock_cam, P6 + more)], config)) >= plain).all()
-    assert (levels_of(bounds([belief(T_dock_cam, P6)], IntegrityConfig(risk=1e-7))) > plain).all()
+    assert (levels_of(bounds([hypothesis(T_dock_cam, P6 + more)], config)) >= plain).all()
+    assert (levels_of(bounds([hypothesis(T_dock_cam, P6)], IntegrityConfig(risk=1e-7))) > plain).all()
 
 
 def test_levels_hold_every_other_belief_that_is_not_out_of_the_question(rng):
     config = IntegrityConfig()
     for _ in range(20):
         T_a, T_b = at(8.0, rng), at(9.0, rng)
-        a = belief(T_a, covariance(rng))
-        near = belief(T_b, covariance(rng), log_weight=-10.0)
+        a = hypothesis(T_a, covariance(rng))
+        near = hypothesis(T_b, covariance(rng), log_weight=-10.0)
         far = replace(near, log_weight=-15.0)  # e^-15 < 1e-6
         wide = levels_of(bounds([a, near], config))
         assert (wide[:2] >= np.array(sizes(T_a, T_b))[:2]).all()
@@ -162,8 +165,8 @@ def test_a_light_that_pulls_the_pose_widens_the_levels_from_six_lights_on(rng):
     apart = np.zeros((M, 18))
     apart[2, :9] = [0.5, -0.3, 0.7, 0.01, 0.02, -0.03, 0.02, 0.03, 0.6]
     apart[2, 9:] = 1e-5
-    plain = levels_of(bounds([belief(T_dock_cam, P6, lights=6)], config))
-    five, six = (levels_of(bounds([belief(T_dock_cam, P6, lights=n, apart=apart)], config)) for n in (5, 6))
+    plain = levels_of(bounds([hypothesis(T_dock_cam, P6, lights=6)], config))
+    five, six = (levels_of(bounds([hypothesis(T_dock_cam, P6, lights=n, apart=apart)], config)) for n in (5, 6))
     assert_close(five, plain)
     moved = [math.hypot(0.5, 0.3), 0.7, np.linalg.norm([0.01, 0.02, 0.03]), math.hypot(0.02, 0.03), 0.6]
     assert (six > np.maximum(plain, moved)).all()
@@ -172,7 +175,7 @@ def test_a_light_that_pulls_the_pose_widens_the_levels_from_six_lights_on(rng):
 def test_a_light_that_cannot_be_left_out_leaves_no_level(rng):
     apart = np.zeros((M, 18))
     apart[1, 9:] = np.inf
-    bound = bounds([belief(at(8.0, rng), covariance(rng), lights=7, apart=apart)], IntegrityConfig())
+    bound = bounds([hypothesis(at(8.0, rng), covariance(rng), lights=7, apart=apart)], IntegrityConfig())
     assert np.isinf(levels_of(bound)).all()
     assert not pose_holds(bound)
     assert not guide_holds(bound)
@@ -221,4 +224,6 @@ def test_a_guide_near_the_dock_holds_as_the_pose_does(z_m, angle):
 def test_stage_is_what_the_pose_rests_on(lights, stage):
     name = np.full(M, -1, np.int64)
     name[list(lights)] = np.arange(len(lights))
-    assert integrity.stage(replace(belief(at(8.0), np.eye(6)), name=name, count=PLAN.count(name)), PLAN) == stage
+    one = hypothesis(at(8.0), np.eye(6))
+    last = replace(one.last, assignment=name, count=MODEL.count(name))
+    assert integrity.stage(replace(one, last=last), MODEL) == stage

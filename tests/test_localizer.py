@@ -136,7 +136,7 @@ def test_cold_poses_are_as_good_as_the_light_allows(z_m, layers):
     localizer, squares, laterals = Localizer(EXACT, CAMERA, cold=True), [], []
     for frame in frames:
         localizer.process_detections(frame.detections)
-        T_cam_dock = localizer.beliefs[0].T_cam_dock
+        T_cam_dock = localizer.state.first.T_cam_dock
         e = claims.pose_error(np.linalg.inv(T_cam_dock), frame.T_dock_cam)
         bound = cramer_rao(frame.T_dock_cam, frame.light[frame.light >= 0])
         squares.append(e @ np.linalg.solve(bound, e))

@@ -5,11 +5,12 @@ import pytest
 from conftest import assert_close
 from numpy.testing import assert_array_equal
 from scipy.spatial.transform import Rotation
-from tracks import CAMERA, CONFIG, PLAN, STATION, M
+from tracks import CAMERA, CONFIG, MODEL, STATION, M
 
 from lumidock import match, verify
 from lumidock.datatypes import Attitude, Detections
 from lumidock.geometry import se3_inverse
+from lumidock.model import attitude_prior, light_of, measurements
 from lumidock.pose import project_lights
 from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import load_scenario
@@ -18,8 +19,8 @@ HEAD_ON = np.diag([1.0, -1.0, -1.0])
 
 
 def acquire(detections, config=CONFIG):
-    found = match.spots(detections, PLAN, config.match)
-    return match.acquire(found, PLAN, CAMERA, match.prior(detections.attitude, config.prior), config.match)
+    found = measurements(detections, MODEL, config.match)
+    return match.acquire(found, MODEL, CAMERA, attitude_prior(detections.attitude, config.prior), config.match)
 
 
 def answer(found):
@@ -67,9 +68,9 @@ def test_a_clear_view_is_named_beyond_doubt(rng):
         found = acquire(shuffled(frame.detections, order))
         assert found.margin > CONFIG.match.margin
         assert answer(found)
-        head = found.candidates[0]
-        assert wrong(head.name, frame.light[order]) == 0
-        assert (head.name >= 0).sum() == 7
+        head = found.hypotheses[0]
+        assert wrong(head.assignment, frame.light[order]) == 0
+        assert (head.assignment >= 0).sum() == 7
         error = head.T_cam_dock @ frame.T_dock_cam
         assert np.linalg.norm(error[:3, 3]) < 0.05 * frame.T_dock_cam[2, 3]
 
@@ -80,7 +81,7 @@ def test_missing_and_spurious_lights_cost_no_wrong_name():
         found = acquire(frame.detections)
         if answer(found):
             accepted += 1
-            assert wrong(found.candidates[0].name, frame.light) == 0
+            assert wrong(found.hypotheses[0].assignment, frame.light) == 0
     assert accepted >= 55
 
 
@@ -90,7 +91,7 @@ def test_the_order_of_detections_does_not_matter(rng):
         one, other = acquire(frame.detections), acquire(shuffled(frame.detections, order))
         assert answer(one) == answer(other)
         assert_close(other.margin, one.margin, atol=1e-3)
-        a, b = one.candidates[0].name, other.candidates[0].name
+        a, b = one.hypotheses[0].assignment, other.hypotheses[0].assignment
         assert_array_equal(np.where(b >= 0, order[b], -1), a)
 
 
@@ -98,8 +99,8 @@ def test_the_same_spots_give_the_same_bytes():
     for frame in frames("joint", "path.count=5"):
         one, other = acquire(frame.detections), acquire(frame.detections)
         assert one.margin == other.margin
-        for a, b in zip(one.candidates, other.candidates, strict=True):
-            assert_array_equal(a.name, b.name)
+        for a, b in zip(one.hypotheses, other.hypotheses, strict=True):
+            assert_array_equal(a.assignment, b.assignment)
             assert_array_equal(a.T_cam_dock, b.T_cam_dock)
             assert a.log_evidence == b.log_evidence
 
@@ -125,14 +126,14 @@ def test_both_layers_are_named_without_their_colours(label):
         found = acquire(frame.detections)
         if answer(found):
             accepted += 1
-            assert wrong(found.candidates[0].name, frame.light) == 0
+            assert wrong(found.hypotheses[0].assignment, frame.light) == 0
     assert accepted >= 25
 
 
 def test_a_right_colour_is_evidence_and_a_wrong_one_is_against():
     def best(*settings):
         seen = frames("joint", "path.count=10", "detections.drop=0.0", *settings, seed=4)
-        return np.array([acquire(frame.detections).candidates[0].log_evidence for frame in seen])
+        return np.array([acquire(frame.detections).hypotheses[0].log_evidence for frame in seen])
 
     right = best("detections.wrong_layer=0.0")
     assert (right > best("detections.wrong_layer=0.0", "detections.color=false")).all()
@@ -151,8 +152,8 @@ def test_a_measured_attitude_names_a_rolled_camera(roll_deg, rng):
         seen = seen_from(truth, lights[order], rng, attitude=Attitude(measured, sigma))
         found = acquire(seen)
         assert answer(found)
-        assert wrong(found.candidates[0].name, order) == 0
-        assert (found.candidates[0].name >= 0).sum() == 7
+        assert wrong(found.hypotheses[0].assignment, order) == 0
+        assert (found.hypotheses[0].assignment >= 0).sum() == 7
         # the prior about head-on does not allow it: nothing, rather than another naming
         without = acquire(replace(seen, attitude=None))
         assert not answer(without)
@@ -161,9 +162,9 @@ def test_a_measured_attitude_names_a_rolled_camera(roll_deg, rng):
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_fewer_than_three_spots_are_too_few(n, rng):
     found = acquire(seen_from(pose(HEAD_ON, [0, 0, 8.0]), np.arange(n), rng))
-    assert (found.candidates, found.others, found.reason) == ((), (), "too_few")
+    assert (found.hypotheses, found.other_poses, found.reason) == ((), (), "too_few")
     assert not answer(found)
-    assert (verify.names_of(found, CONFIG.match, M) == -1).all()
+    assert not verify.is_answer(found, CONFIG.match)
 
 
 def test_three_spots_alone_are_no_answer(rng):
@@ -180,12 +181,12 @@ def test_spots_that_hardly_look_like_lamps_stay_out(rng):
         found = acquire(replace(Detections.from_uv("f", 0, uv[order]), p_light=p_light[order]))
         light = np.concatenate([frame.light, np.full(len(junk), -1)])[order]
         assert answer(found)
-        assert wrong(found.candidates[0].name, light) == 0
+        assert wrong(found.hypotheses[0].assignment, light) == 0
 
 
 def test_a_frame_of_more_lamps_than_can_be_looked_at_is_no_answer(rng):
     found = acquire(Detections.from_uv("f", 0, rng.uniform(0, 2000, (199, 2))))
-    assert (found.reason, found.candidates) == ("too_many", ())
+    assert (found.reason, found.hypotheses) == ("too_many", ())
 
 
 def test_spots_at_one_place_or_in_a_line_are_refused_quietly():
@@ -198,45 +199,45 @@ def test_spots_at_one_place_or_in_a_line_are_refused_quietly():
 def test_centres_bring_their_covariance_or_get_the_configured_one():
     frame = frames("missing-spurious", "path.count=1", "faults.missing=0", "faults.spurious=0", seed=6)[0]
     cov = np.repeat(np.array([[[0.4, 0.1], [0.1, 0.2]]]), len(frame.light), axis=0)
-    seen = match.spots(replace(frame.detections, cov_px2=cov), PLAN, CONFIG.match)
+    seen = measurements(replace(frame.detections, cov_px2=cov), MODEL, CONFIG.match)
     assert_array_equal(seen.cov, cov)
     assert_close(seen.var, 0.3)
     assert answer(acquire(replace(frame.detections, cov_px2=cov)))
-    without = match.spots(frame.detections, PLAN, CONFIG.match)
+    without = measurements(frame.detections, MODEL, CONFIG.match)
     assert_close(without.cov, np.repeat(np.eye(2)[None], len(frame.light), axis=0) * CONFIG.match.noise_px**2)
 
 
 def test_likelihoods_are_of_the_right_layer():
     detections = replace(Detections.from_uv("f", 0, np.eye(3, 2)), p_rear=np.array([0.95, 0.05, np.nan]))
-    like = match.spots(detections, PLAN, CONFIG.match).like
+    like = measurements(detections, MODEL, CONFIG.match).like
     trusted = 0.5 + CONFIG.match.label_trust * 0.45
     high, low = np.log(2 * trusted), np.log(2 * (1 - trusted))
     assert_close(like, [[low, high], [high, low], [0.0, 0.0]])
-    assert_array_equal(PLAN.is_rear, [0, 1])
+    assert_array_equal(MODEL.is_rear, [0, 1])
 
 
 def test_pairs_come_once_in_one_layer_and_count_down_what_is_unseen():
     for lights in map(STATION.lights_of, STATION.layers):
-        mine = [tuple(sorted(pair)) for pair in PLAN.pairs.tolist() if pair[0] in lights]
+        mine = [tuple(sorted(pair)) for pair in MODEL.order.pairs.tolist() if pair[0] in lights]
         assert len(mine) == len(set(mine)) == len(lights) * (len(lights) - 1) // 2
-        assert_array_equal(np.sort(PLAN.rank[lights]), np.arange(len(lights)))
-    assert (STATION.layer[PLAN.pairs[:, 0]] == STATION.layer[PLAN.pairs[:, 1]]).all()
-    assert (np.diff(PLAN.unseen) <= 0).all()
+        assert_array_equal(np.sort(MODEL.order.rank[lights]), np.arange(len(lights)))
+    assert (STATION.layer[MODEL.order.pairs[:, 0]] == STATION.layer[MODEL.order.pairs[:, 1]]).all()
+    assert (np.diff(MODEL.order.unseen) <= 0).all()
     # by definition: the most lights of one layer, no two of which are a pair before
-    for k in (0, 5, 15, len(PLAN.pairs) - 1):
-        before = {frozenset(pair) for pair in PLAN.pairs[:k].tolist()}
+    for k in (0, 5, 15, len(MODEL.order.pairs) - 1):
+        before = {frozenset(pair) for pair in MODEL.order.pairs[:k].tolist()}
         most = 0
         for bits in range(1 << 7):
             for lights in map(STATION.lights_of, STATION.layers):
                 some = [int(c) for j, c in enumerate(lights) if bits >> j & 1]
                 if not any(frozenset((a, b)) in before for a in some for b in some if a < b):
                     most = max(most, len(some))
-        assert PLAN.unseen[k] >= most
+        assert MODEL.order.unseen[k] >= most
 
 
 def test_planes_of_the_layers_hold_their_lights():
     for k, layer in enumerate(STATION.layers):
-        point, normal = PLAN.planes[k, :3], PLAN.planes[k, 3:]
+        point, normal = MODEL.planes[k, :3], MODEL.planes[k, 3:]
         assert_close(np.linalg.norm(normal), 1.0)
         assert_close((STATION.p_dock[STATION.lights_of(layer)] - point) @ normal, 0.0)
 
@@ -244,10 +245,10 @@ def test_planes_of_the_layers_hold_their_lights():
 def test_the_best_pose_explains_its_names():
     for frame in frames("joint", "path.count=10", seed=7):
         found = acquire(frame.detections)
-        for candidate in found.candidates[:1]:
-            lights = np.flatnonzero(candidate.name >= 0)
+        for candidate in found.hypotheses[:1]:
+            lights = np.flatnonzero(candidate.assignment >= 0)
             uv = project_lights(CAMERA, se3_inverse(candidate.T_cam_dock), STATION.p_dock[lights])
-            off = uv - frame.detections.uv[candidate.name[lights]]
+            off = uv - frame.detections.uv[candidate.assignment[lights]]
             assert np.sqrt((off**2).mean()) < 1.5
 
 
@@ -257,10 +258,13 @@ def test_every_pose_of_the_best_names_fits_them(scenario):
     seconds = 0
     for frame in frames(scenario, seed=6)[:150]:
         found = acquire(frame.detections)
-        for other in found.others:
-            lights = np.flatnonzero(other.name >= 0)
+        for other in found.other_poses:
+            lights = np.flatnonzero(other.assignment >= 0)
             T_dock_cam = np.linalg.inv(other.T_cam_dock)
-            off = project_lights(CAMERA, T_dock_cam, STATION.p_dock[lights]) - frame.detections.uv[other.name[lights]]
+            off = (
+                project_lights(CAMERA, T_dock_cam, STATION.p_dock[lights])
+                - frame.detections.uv[other.assignment[lights]]
+            )
             assert np.sqrt((off**2).mean()) < 3.0
             seconds += 1
     assert seconds > 20 or scenario == "joint"
@@ -270,7 +274,7 @@ def test_light_of_is_the_inverse_of_a_naming(rng):
     for _ in range(20):
         n = 15
         name = np.where(rng.random(M) < 0.5, rng.permutation(n)[:M], -1)
-        light = match.light_of(name, n)
+        light = light_of(name, n)
         assert_array_equal(true_names(light), name)
         assert (light >= 0).sum() == (name >= 0).sum()
 

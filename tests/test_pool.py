@@ -52,7 +52,7 @@ def test_lights_beside_a_white_funnel_are_found_and_named():
         assert number >= 41 or not holds
         locked += [holds] if number >= 84 else []
         if holds and fix.status != "coasting":
-            T_cam_dock = localizer.beliefs[0].T_cam_dock
+            T_cam_dock = localizer.state.first.T_cam_dock
             uv = camera.project(station.p_dock @ T_cam_dock[:3, :3].T + T_cam_dock[:3, 3])
             named = fix.match.light >= 0
             errors += np.linalg.norm(fix.match.detections.uv[named] - uv[fix.match.light[named]], axis=1).tolist()

@@ -1,27 +1,28 @@
-"""May a pose be used: protection levels, alert limits, the two levels of trust and the docking stage."""
+"""May a pose be used: protection levels, alert limits, the two levels of trust, the docking stage; and the fix."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
-from lumidock._kernels.tracking.levels import levels
+from lumidock._kernels.tracking.levels import SigmaFactors, protection_levels
 from lumidock.config import IntegrityConfig
-from lumidock.datatypes import Array, Guide, Protection, Stage
-from lumidock.match import Plan
+from lumidock.datatypes import Array, Detections, Fix, Guide, Match, Protection, Stage, Status
+from lumidock.model import StationModel, light_of
+from lumidock.state import Context, LocalizerState
 from lumidock.track import Track
+from lumidock.verify import is_proven
 
 # default alert limits: below this z m, metres for the lateral and the axial error each, degrees of rotation
 _NEAR_LIMITS = ((1.5, 0.3, 5.0), (5.0, 0.5, 5.0), (12.0, 1.0, 8.0))
 _FAR_SHARE, _FAR_DEG = 0.10, 10.0  # beyond: a share of z, and degrees
-GUIDE_BEARING_RAD, GUIDE_RANGE_M, GUIDE_RANGE_SHARE = math.radians(1.5), 0.3, 0.10
-_ANY_BEARING = math.sqrt(2.0) * math.pi  # at the origin itself a bearing says nothing ...
-_CLEAR, _STEEP = 2.0, 0.3  # ... which begins so many range levels away, or with a bearing level of so many rad
-_IDENTITY = np.eye(4)
+_GUIDE_BEARING_RAD, _GUIDE_RANGE_M, _GUIDE_RANGE_SHARE = math.radians(1.5), 0.3, 0.10  # the contract's
+_ANY_BEARING_RAD = math.sqrt(2.0) * math.pi  # at the origin itself a bearing says nothing ...
+_CLEAR, _STEEP_RAD = 2.0, 0.3  # ... which begins so many range levels away, or with such a bearing level
 GUIDE_FROM_M = 3.0  # nearer to the dock's origin, or past it, bearing and range say nothing and the pose decides
 
 
@@ -46,6 +47,11 @@ def alert_limit(z_m: float, pl_axial_m: float) -> tuple[float, float]:
     return _FAR_SHARE * z, math.radians(_FAR_DEG)
 
 
+def guide_limits(range_m: Array | float) -> tuple[float, Array]:
+    """Alert limits of a guide from afar: bearing rad, and range m at a distance of `range_m`, which may be an array."""
+    return _GUIDE_BEARING_RAD, np.maximum(_GUIDE_RANGE_M, _GUIDE_RANGE_SHARE * np.asarray(range_m))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Bounds:
     """A pose `T_dock_cam` (4, 4), its covariance (6, 6) in dock axes, its guide and all their protection levels."""
@@ -56,26 +62,26 @@ class Bounds:
     guide: Guide
 
 
-def bounds(beliefs: Sequence[Track], config: IntegrityConfig) -> Bounds:
-    """Protection of the first belief, wide enough to hold every other that is likelier than the risk.
+def bounds(tracks: Sequence[Track], config: IntegrityConfig) -> Bounds:
+    """Protection of the first hypothesis, wide enough to hold every other that is likelier than the risk.
 
     Without a fault the levels are factors on sigma; with six or more lights they also hold when any one of them is at
     fault (M. Joerger et al., "Solution separation versus residual-based RAIM", 2014).
     """
-    first = beliefs[0]
+    first = tracks[0]
     cov = np.empty((9, 9))
     pl = _levels(first, config, cov)
-    for other in beliefs[1:]:
+    for other in tracks[1:]:
         if first.log_weight - other.log_weight < -math.log(config.risk):
             apart = _apart(first, other)
             wider = apart + np.array(_levels(other, config, np.empty((9, 9))))
             pl = tuple(np.maximum(pl, wider).tolist())
-    T_dock_cam, R_dock_cam = _IDENTITY.copy(), first.R.T
-    T_dock_cam[:3, :3], T_dock_cam[:3, 3] = R_dock_cam, -(R_dock_cam @ first.t)
-    x, y, z = first.t.tolist()
+    T_dock_cam, R_dock_cam, t = np.eye(4), first.state.R.T, first.state.t
+    T_dock_cam[:3, :3], T_dock_cam[:3, 3] = R_dock_cam, -(R_dock_cam @ t)
+    x, y, z = t.tolist()
     reach = math.sqrt(x * x + y * y + z * z)
     lateral, axial, angle, bearing, distance = pl
-    linear = bearing < _STEEP and min(math.hypot(x, z), math.hypot(y, z)) > _CLEAR * distance
+    linear = bearing < _STEEP_RAD and min(math.hypot(x, z), math.hypot(y, z)) > _CLEAR * distance
     return Bounds(
         T_dock_cam,
         cov[:6, :6],
@@ -84,27 +90,19 @@ def bounds(beliefs: Sequence[Track], config: IntegrityConfig) -> Bounds:
             math.atan2(x, z),
             math.atan2(y, z),
             reach,
-            bearing if linear else max(bearing, _ANY_BEARING),
+            bearing if linear else max(bearing, _ANY_BEARING_RAD),
             distance,
         ),
     )
 
 
 def _levels(track: Track, config: IntegrityConfig, cov: Array) -> tuple[float, ...]:
-    """Lateral m, axial m, angle rad, bearing rad, range m of one belief; fills `cov` (9, 9)."""
-    used = track.n_used
-    fault_risk = min(config.risk / (config.fault * max(used, 1)), 0.5)
-    return levels(
-        track.R,
-        track.t,
-        track.P,
-        track.apart,
-        track.plane,
-        sigma_factors(config.risk),
-        sigma_factors(fault_risk),
-        used >= config.separate_from,
-        cov,
-    )
+    """Lateral m, axial m, angle rad, bearing rad, range m of one hypothesis; fills `cov` (9, 9)."""
+    last = track.last
+    fault_risk = min(config.risk / (config.fault * max(last.n_used, 1)), 0.5)
+    separate = last.n_used >= config.separate_from
+    factors = SigmaFactors(sigma_factors(config.risk), sigma_factors(fault_risk), separate)
+    return protection_levels(track.state, last.separations, last.plane, factors, cov)
 
 
 @cache
@@ -131,11 +129,12 @@ def _tail(k: float, dimensions: int) -> float:
 
 def _apart(a: Track, b: Track) -> Array:
     """How far two poses lie apart in what the levels bound: lateral, axial, angle, bearing, range (5,)."""
-    at = -(a.R.T @ a.t) + b.R.T @ b.t
-    turn = math.acos(min(max(0.5 * (float(np.trace(a.R.T @ b.R)) - 1.0), -1.0), 1.0))
-    between = [math.atan2(a.t[k], a.t[2]) - math.atan2(b.t[k], b.t[2]) for k in (0, 1)]
+    (Ra, ta, *_), (Rb, tb, *_) = a.state, b.state
+    at = -(Ra.T @ ta) + Rb.T @ tb
+    turn = math.acos(min(max(0.5 * (float(np.trace(Ra.T @ Rb)) - 1.0), -1.0), 1.0))
+    between = [math.atan2(ta[k], ta[2]) - math.atan2(tb[k], tb[2]) for k in (0, 1)]
     bearing = math.hypot(*(math.remainder(angle, 2.0 * math.pi) for angle in between))
-    distance = abs(float(np.linalg.norm(a.t) - np.linalg.norm(b.t)))
+    distance = abs(float(np.linalg.norm(ta) - np.linalg.norm(tb)))
     return np.array([math.hypot(at[0], at[1]), abs(at[2]), turn, bearing, distance])
 
 
@@ -151,14 +150,60 @@ def guide_holds(bound: Bounds) -> bool:
     guide = bound.guide
     if guide.range_m - guide.pl_range_m < GUIDE_FROM_M or abs(guide.bearing_x_rad) > math.pi / 2.0:
         return pose_holds(bound)
-    limit_m = max(GUIDE_RANGE_M, GUIDE_RANGE_SHARE * (guide.range_m - guide.pl_range_m))
-    return guide.pl_bearing_rad < GUIDE_BEARING_RAD and guide.pl_range_m < limit_m
+    limit_rad, limit_m = guide_limits(guide.range_m - guide.pl_range_m)
+    return guide.pl_bearing_rad < limit_rad and guide.pl_range_m < float(limit_m)
 
 
-def stage(track: Track, plan: Plan) -> Stage | None:
+def stage(track: Track, model: StationModel) -> Stage | None:
     """Docking stage by the layers that the pose rests on (paper section 2.2); None without a light."""
-    rear = sum(c for c, is_rear in zip(track.count, plan.is_rear, strict=True) if is_rear)
-    front = track.n_used - rear
+    rear = sum(c for c, is_rear in zip(track.last.count, model.is_rear, strict=True) if is_rear)
+    front = track.last.n_used - rear
     if front and rear:
         return "transition"
     return "rear" if rear else "front" if front else None
+
+
+def assess(
+    state: LocalizerState, detections: Detections, status: Status, context: Context
+) -> tuple[Fix, LocalizerState]:
+    """The fix of the likeliest hypothesis as far as it can be trusted, and the state with its docking stage."""
+    first, config = state.first, context.config.integrity
+    if status == "coasting" and (reason := _why_no_coasting(first, detections.t_ns, config)):
+        return no_fix(state, detections, status, reason), state
+    bound = bounds(state.hypotheses, config)
+    proven = is_proven(first, state.margin, config)
+    valid, used = proven and pose_holds(bound), first.last.n_used
+    state = replace(state, stage=stage(first, context.model) or state.stage)
+    fix = Fix(
+        detections.frame,
+        detections.t_ns,
+        status,
+        state.stage,
+        n_seen=len(detections),
+        n_used=used,
+        T_dock_cam=bound.T_dock_cam if valid else None,
+        reason="" if valid else "protection" if proven else "ambiguous",
+        match=Match(detections, light_of(first.last.assignment, len(detections))),
+        covariance=bound.covariance if valid else None,
+        protection=bound.protection if valid else None,
+        guide=bound.guide if proven and guide_holds(bound) else None,
+        nis=first.last.nis / (2 * used) if status == "tracking" else math.nan,
+    )
+    return fix, state
+
+
+def _why_no_coasting(first: Track, t_ns: int, config: IntegrityConfig) -> str:
+    """The word for a track that no light fits in this frame and that may not be used without one, or nothing.
+
+    A failed test ends trust at once, a dark frame when the last light is too old.
+    """
+    if first.agreeing_frames == 0:  # nothing has agreed since a test failed, or for too long
+        return "residual"
+    return "stale" if (t_ns - first.seen.light_ns) * 1e-9 > config.max_age_s else ""
+
+
+def no_fix(state: LocalizerState, detections: Detections, status: Status, reason: str) -> Fix:
+    """The answer to a frame that gives no pose, and why."""
+    spurious = Match(detections, np.full(len(detections), -1, np.int64))
+    frame, t_ns, seen = detections.frame, detections.t_ns, len(detections)
+    return Fix(frame, t_ns, status, state.stage, n_seen=seen, reason=reason, match=spurious)

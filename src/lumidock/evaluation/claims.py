@@ -14,13 +14,11 @@ import numpy as np
 
 from lumidock.datatypes import Array, require_shape
 from lumidock.geometry import bearing_and_range, so3_log
-from lumidock.integrity import alert_limits
+from lumidock.integrity import GUIDE_FROM_M, alert_limits, guide_limits
 
 POSE_ERRORS, GUIDE_ERRORS = ("lateral", "axial", "angle"), ("bearing", "range")
 LONG_GAP_NS = 450_000_000  # three frames of the approach
-_BEARING_LIMIT_RAD, _RANGE_LIMIT_M, _RANGE_LIMIT_SHARE = np.deg2rad(1.5), 0.3, 0.1
 _MIN_EIGENVALUE = 1e-12  # of a correlation matrix; less is rounding of the file
-_GUIDE_FROM_M = 3.0  # nearer than this a guide has no limits of its own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,11 +79,9 @@ class GuideClaims:
     def limits(self) -> Array:
         """Alert limits (M, 2) in the order of `sizes`; infinite near the origin, and with it behind the camera."""
         range_m, ahead = self.claimed[:, 2], (np.abs(self.claimed[:, :2]) < np.pi / 2).all(axis=1)
-        limits = np.stack(
-            [np.full_like(range_m, _BEARING_LIMIT_RAD), np.maximum(_RANGE_LIMIT_M, _RANGE_LIMIT_SHARE * range_m)],
-            axis=1,
-        )
-        return np.where((ahead & (range_m > _GUIDE_FROM_M))[:, None], limits, np.inf)
+        bearing_rad, limit_m = guide_limits(range_m)
+        limits = np.stack([np.full_like(range_m, bearing_rad), limit_m], axis=1)
+        return np.where((ahead & (range_m > GUIDE_FROM_M))[:, None], limits, np.inf)
 
 
 Claims = PoseClaims | GuideClaims

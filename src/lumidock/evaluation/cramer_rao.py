@@ -1,4 +1,4 @@
-"""What the lights in view allow at best: the filter's covariance along the true path, with the true names.
+"""What the lights in view allow at best: the filter's covariance along the true path, with the true association.
 
 A recursive Cramer-Rao bound (P. Tichavsky, C. Muravchik, A. Nehorai, 1998) under the filter's own noise, priors and
 history: where it is inside the alert limits with room to spare, a valid fix is owed.
@@ -10,20 +10,21 @@ import math
 
 import numpy as np
 
-from lumidock import match, track
+from lumidock import track
 from lumidock._kernels.tracking import track as kernel
-from lumidock._kernels.tracking.levels import levels
-from lumidock._kernels.tracking.track import State
-from lumidock._kernels.tracking.update import Pixels, take_in
+from lumidock._kernels.tracking.levels import SigmaFactors, protection_levels
+from lumidock._kernels.tracking.track import FilterState
+from lumidock._kernels.tracking.update import Assigned, UpdateRules, update
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Indices
 from lumidock.geometry import se3_inverse
 from lumidock.integrity import alert_limit, sigma_factors
+from lumidock.light_counts import CHECKED_LIGHTS, LAYER_LIGHTS
+from lumidock.model import attitude_prior, station_model
 from lumidock.pose import project_lights
 from lumidock.station import Station
 
-_MIN_START = 4
 _ROOM = 1.3  # a protection level this many times the bound's is still owed
 
 
@@ -32,9 +33,10 @@ class Bound:
 
     def __init__(self, station: Station, camera: Camera, config: Config, *, cold: bool = False) -> None:
         self.station, self.camera, self.config, self.cold = station, camera, config, cold
-        self._plan = match.plan(station, camera, config.match)
-        self._prior = match.prior(None, config.prior)
-        self._factors = sigma_factors(config.integrity.risk)
+        self._model = station_model(station, camera, config.match)
+        self._prior = attitude_prior(None, config.prior)
+        factors = sigma_factors(config.integrity.risk)
+        self._factors = SigmaFactors(factors, factors, False)
         self.forget()
 
     def forget(self) -> None:
@@ -42,7 +44,7 @@ class Bound:
         self._P: Array | None = None
         self._t_ns = self._lights_ns = self._agreed_ns = 0
         self._joint = False
-        self._known = np.zeros(self._plan.n_layers, bool)
+        self._known = np.zeros(self._model.n_layers, bool)
 
     def step(self, t_ns: int, T_dock_cam: Array, lights: Indices) -> Array | None:
         """Lateral m, axial m and angle rad of protection at `t_ns` on the true pose with `lights` (K,) detected."""
@@ -51,7 +53,7 @@ class Bound:
         T_cam_dock = se3_inverse(T_dock_cam)
         R, t = np.ascontiguousarray(T_cam_dock[:3, :3]), np.ascontiguousarray(T_cam_dock[:3, 3])
         if self._P is None:
-            if len(lights) < _MIN_START:
+            if len(lights) < CHECKED_LIGHTS:
                 return None
             self._P = self._start(R, t)
         else:
@@ -60,15 +62,18 @@ class Bound:
         if len(lights):
             self._update(R, t, T_dock_cam, lights)
             self._lights_ns = t_ns
-            self._agreed_ns = t_ns if len(lights) >= _MIN_START else self._agreed_ns
+            self._agreed_ns = t_ns if len(lights) >= CHECKED_LIGHTS else self._agreed_ns
         elif t_ns - self._lights_ns > self.config.integrity.max_age_s * 1e9:
             return None
         if t_ns - self._agreed_ns > self.config.track.max_gap_s * 1e9:
             return None  # three lights fit many poses
-        nothing = np.zeros((len(self.station), 18))
-        return np.array(
-            levels(R, t, self._P, nothing, track.NO_PLANE, self._factors, self._factors, False, np.empty((9, 9)))[:3]
-        )
+        nothing, state = np.zeros((len(self.station), 18)), self._at(R, t)
+        return np.array(protection_levels(state, nothing, track.NO_PLANE, self._factors, np.empty((9, 9)))[:3])
+
+    def _at(self, R: Array, t: Array) -> FilterState:
+        """The filter on the true pose `R`, `t` of T_cam_dock; its covariance is shared, and changes in place."""
+        assert self._P is not None
+        return FilterState(R.copy(), t.copy(), np.zeros(len(self._P)), self._P)
 
     def owes(self, t_ns: int, T_dock_cam: Array, lights: Indices) -> bool:
         """Whether a valid fix is owed in this frame: 1.3 times the bound is inside the alert limits."""
@@ -80,41 +85,35 @@ class Bound:
         return max(lateral, axial) < limit_m and angle < limit_rad and math.isfinite(lateral)
 
     def _start(self, R: Array, t: Array) -> Array:
-        x, P = track.start_states(self.station, None, self.config.track)
-        kernel.attitude_update(R.copy(), t.copy(), x, P, self._prior.R_dock_cam, 1.0 / self._prior.info, False)
+        x, P = track.open_states(track.calibration_prior(self.station, None), self.config.track)
+        state = FilterState(R.copy(), t.copy(), x, P)
+        kernel.attitude_update(state, self._prior.R_dock_cam, 1.0 / self._prior.info, False)
         return P
 
     def _predict(self, R: Array, t: Array, dt: float) -> None:
         config = self.config.track
-        assert self._P is not None
-        kernel.predict(R.copy(), t.copy(), np.zeros(6), self._P, dt, config.accel_m_s2**2, config.accel_rad_s2**2)
+        kernel.predict(self._at(R, t), dt, config.accel_m_s2**2, config.accel_rad_s2**2)
 
     def _update(self, R: Array, t: Array, T_dock_cam: Array, lights: Indices) -> None:
         """Exact pixels of the lights: the mean stays where it is, and the covariance shrinks.
 
         A layer counts from the first frame on that shows three lights of it, as in the filter.
         """
-        assert self._P is not None
-        count = np.bincount(self._plan.layer[lights], minlength=self._plan.n_layers)
-        self._known |= (count >= track.LAYER_LIGHTS) | (count == count.max())
-        lights = lights[self._known[self._plan.layer[lights]]]
-        name = np.full(len(self.station), -1, np.int64)
-        name[lights] = np.arange(len(lights))
+        count = np.bincount(self._model.layer[lights], minlength=self._model.n_layers)
+        self._known |= (count >= LAYER_LIGHTS) | (count == count.max())
+        lights = lights[self._known[self._model.layer[lights]]]
+        assignment = np.full(len(self.station), -1, np.int64)
+        assignment[lights] = np.arange(len(lights))
         uv = project_lights(self.camera, T_dock_cam, self.station.p_dock[lights])
         cov = np.tile(np.eye(2) * self.config.match.noise_px**2, (len(lights), 1, 1))
-        self._joint = self._joint or track.is_joint(name, self._plan, self.config.track)
-        n = len(self._P) if self._joint else kernel.CALIBRATION
-        take_in(
-            self._plan.lens,
-            self._plan.p_dock,
-            R,
-            t,
-            State(R.copy(), t.copy(), np.zeros(len(self._P)), self._P),
-            Pixels(name, uv, cov),
-            n,
-            1,
-            track.NO_PLANE,
-            np.eye(3),
-            False,
-            np.zeros((len(name), 18)),
+        self._joint = self._joint or track.sees_two_layers(self._model.count(assignment), self.config.track)
+        state = self._at(R, t)
+        rules = UpdateRules(
+            estimated=len(state.P) if self._joint else kernel.CALIBRATION,
+            steps=1,
+            tracking=False,
+            plane=track.NO_PLANE,
+            turn_cov=np.eye(3),
         )
+        separations = np.zeros((len(assignment), 18))
+        update(self._model.lights, R, t, state, Assigned(assignment, uv, cov), rules, separations)

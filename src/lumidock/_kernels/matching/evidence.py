@@ -1,4 +1,19 @@
-"""How probable a naming of one frame's detections is, with the pose integrated out."""
+"""The log evidence of one association of a frame's detections with lights, its pose integrated out.
+
+For an association A of K of the N detections with lights, over the hypothesis "all N are clutter":
+
+    log E(A) = sum over assigned lights c [ log p_D + log l(i_c, layer_c) ]        `detect`, `like`
+             + sum over layers [ log of the probability of its missed lights ]     `detect`, `absent`
+             - log_clutter[K]                                                      what clutter would have explained
+             + log integral over poses of prod_c N(uv_i; h_c(T), var_i + survey) p(T)
+
+The integral is Laplace's: at the most probable pose T of cost chi^2 (prior included) and normal matrix H,
+
+    3 log 2 pi + 1/2 log |info| - 3/2 log 2 pi - chi^2 / 2 - 1/2 log |H| - sum_c log(2 pi var_c) + log p(t)
+
+`log_det` is log |H|, `cost` chi^2, `log_var` the sum of log(2 pi var_c), `info` the information of the attitude prior.
+Source: D. MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, chapter 27.
+"""
 
 from __future__ import annotations
 
@@ -8,29 +23,50 @@ from typing import NamedTuple
 import numpy as np
 
 from lumidock._kernels import constant
-from lumidock._kernels.compiling import entry, part
+from lumidock._kernels.compiling import part
 from lumidock._kernels.lens import copy_to, inside
 from lumidock._kernels.pose import light_row, refine, set_pose
+from lumidock._kernels.visibility import EDGE_PX, faces
 from lumidock.datatypes import Array, Indices
 
-# entries of the parameters `q`
-LOG_VOLUME, DETECT, ABSENT, GATE, NEAR_M, FAR_M, ROLL_GATE, BEND, STEADY, PAIR_GATE = range(10)
 LOG_2PI = math.log(2.0 * math.pi)
-HUGE = 1e300
+HUGE = 1e300  # as a log evidence, negative: impossible
 _ELSEWHERE = 8.0  # log odds of two priors that one solution under both cannot reach
-_EDGE_PX, _SHINES = 3.0, 0.1  # a light this near the edge, or seen this flat (cosine), may be missing at no cost
-STEPS = constant(6)  # of Gauss-Newton, at most
+STEPS = constant(6)  # of Gauss-Newton, at most; from a pose that is nearly right two or three are enough
 
 
-class Scene(NamedTuple):
-    """One frame: the lights of the station as a lens sees it, the detections, and what is expected of the attitude.
+class SearchRules(NamedTuple):
+    """The scalars of the acquisition's model.
+
+    `log_volume`: log of the volume m^3 of the view cone up to `far_m`. `detect`: probability that a light in view is
+    detected; `absent`: that a whole layer is not seen. `gate`, `pair_gate`: chi-square (2 dof) of a detection for a
+    light that is placed by three lights or more, by two and the attitude prior. `near_m`, `far_m`: distances of a
+    light. `roll_gate`: largest roll rad off the prior. `bend`: variance per px^2 of separation that the unknown tilt
+    adds. `steady`: share of vehicles that hold the expected attitude well.
+    """
+
+    log_volume: float
+    detect: float
+    absent: float
+    gate: float
+    pair_gate: float
+    near_m: float
+    far_m: float
+    roll_gate: float
+    bend: float
+    steady: float
+
+
+class Problem(NamedTuple):
+    """The acquisition of one frame: the station's lights, the detections, and what is expected of the attitude.
 
     Flat, because numba counts the references to every array of a tuple that it takes out of another. M lights: lens
     (16,), positions `p` (M, 3) m, `layer` (M,), `axis` (M, 3), `survey_m2` (M,) variance of a position, and the `rank`
     (M,) of each in its layer. N detections: `uv` (N, 2) px and their order `by_u` (N,) by column, `ray` (N, 3), `var`
     (N,) px^2 and the largest of them, log likelihood ratio of each for each layer `like` (N, L), and `log_clutter`
-    (N + 1,), the log price of naming so many. The attitude: `Rp` (3, 3) = R_dock_cam, `info` (3,) 1/rad^2 of tilt, tilt
-    and roll, `steady` (3,) the same of a vehicle that holds its attitude well, and the parameters `q`.
+    (N + 1,), the log probability of so many as clutter. The attitude prior: `Rp` (3, 3) = R_dock_cam, `info` (3,)
+    1/rad^2 of tilt toward cam x, toward cam y and of roll; `steady` (3,) the same of a vehicle that holds its attitude
+    well.
     """
 
     lens: Array
@@ -49,32 +85,32 @@ class Scene(NamedTuple):
     Rp: Array
     info: Array
     steady: Array
-    q: Array
+    rules: SearchRules
 
 
-class Naming(NamedTuple):
-    """A hypothesis: `name` (M,), the detection that each light is given, or -1; and its pose `R`, `t` of T_cam_dock."""
+class Candidate(NamedTuple):
+    """A hypothesis, changed in place: the detection of each light or -1, `assignment` (M,), and T_cam_dock `R`, `t`."""
 
-    name: Indices
+    assignment: Indices
     R: Array
     t: Array
 
 
 @part
-def copied(one: Naming) -> Naming:
+def copied(one: Candidate) -> Candidate:
     """The same hypothesis in arrays of its own."""
-    return Naming(one.name.copy(), one.R.copy(), one.t.copy())
+    return Candidate(one.assignment.copy(), one.R.copy(), one.t.copy())
 
 
 @part
-def put(target: Naming, source: Naming) -> None:
+def put(target: Candidate, source: Candidate) -> None:
     """Overwrite a hypothesis, in place."""
-    copy_to(source.name, target.name)
+    copy_to(source.assignment, target.assignment)
     set_pose(target.R, target.t, source.R, source.t)
 
 
 @part
-def keep(e: float, best: float, one: Naming, better: Naming) -> float:
+def keep(e: float, best: float, one: Candidate, better: Candidate) -> float:
     """Remember in `better`, in place, a hypothesis of log evidence `e` that beats the best; the better of the two."""
     if not e > best:
         return best
@@ -90,78 +126,67 @@ def survey_var(lens: Array, R: Array, t: Array, p: Array, survey_m2: float) -> f
 
 
 @part
-def fit(one: Naming, scene: Scene, info: Array, steps: int, H: Array, L: Array) -> tuple[float, float, float]:
-    """Most probable pose of the named lights, in place: cost, log det H, and the sum of log(2 pi variance)."""
-    name, R, t = one
-    used, log_var = named_lights(name), 0.0
+def fit(one: Candidate, problem: Problem, info: Array, steps: int, H: Array, L: Array) -> tuple[float, float, float]:
+    """Most probable pose of the assigned lights, in place: cost, log det H, and the sum of log(2 pi variance)."""
+    assignment, R, t = one
+    used, log_var = assigned_lights(assignment), 0.0
     ps, uvs, vs = np.empty((len(used), 3)), np.empty((len(used), 2)), np.empty(len(used))
     for k in range(len(used)):
         c = used[k]
-        copy_to(scene.p[c], ps[k])
-        copy_to(scene.uv[name[c]], uvs[k])
-        vs[k] = scene.var[name[c]] + survey_var(scene.lens, R, t, scene.p[c], scene.survey_m2[c])
+        copy_to(problem.p[c], ps[k])
+        copy_to(problem.uv[assignment[c]], uvs[k])
+        vs[k] = problem.var[assignment[c]] + survey_var(problem.lens, R, t, problem.p[c], problem.survey_m2[c])
         log_var += LOG_2PI + math.log(vs[k])
-    cost, log_det = refine(scene.lens, ps, uvs, vs, R, t, scene.Rp, info, steps, H, L)
+    cost, log_det = refine(problem.lens, ps, uvs, vs, R, t, problem.Rp, info, steps, H, L)
     return cost, log_det, log_var
 
 
 @part
-def log_evidence(one: Naming, scene: Scene, info: Array, fitted: tuple[float, float, float]) -> float:
+def log_evidence(one: Candidate, problem: Problem, info: Array, fitted: tuple[float, float, float]) -> float:
     """Log evidence of a hypothesis over "all clutter", the pose integrated out by Laplace's method."""
-    name, R, t = one
-    q = scene.q
+    assignment, R, t = one
+    rules = problem.rules
     cost, log_det, log_var = fitted
     if math.isnan(cost) or math.isnan(log_det):
         return -HUGE
-    total = 1.5 * LOG_2PI - 0.5 * log_det - 0.5 * cost - log_var - scene.log_clutter[named(name)]
-    distance = max(math.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2]), q[NEAR_M])
+    total = 1.5 * LOG_2PI - 0.5 * log_det - 0.5 * cost - log_var - problem.log_clutter[n_assigned(assignment)]
+    distance = max(math.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2]), rules.near_m)
     # position prior: half flat inside the view cone, half flat in the logarithm of the distance
-    near = (q[FAR_M] / distance) ** 3 / (3.0 * math.log(q[FAR_M] / q[NEAR_M]))
-    total += math.log(0.5 + 0.5 * near) - q[LOG_VOLUME]
+    near = (rules.far_m / distance) ** 3 / (3.0 * math.log(rules.far_m / rules.near_m))
+    total += math.log(0.5 + 0.5 * near) - rules.log_volume
     for k in range(3):
         total += 0.5 * math.log(info[k])
-    layers = scene.like.shape[1]
+    layers = problem.like.shape[1]
     matched, missed = np.zeros(layers, np.int64), np.zeros(layers, np.int64)
     h = np.empty(14)
-    for c in range(len(name)):
-        i, layer = name[c], scene.layer[c]
+    for c in range(len(assignment)):
+        i, layer = assignment[c], problem.layer[c]
         if i >= 0:
-            total += math.log(q[DETECT]) + scene.like[i, layer]
+            total += math.log(rules.detect) + problem.like[i, layer]
             matched[layer] += 1
-        elif light_row(scene.lens, R, t, scene.p[c], h) and inside(scene.lens, h[0], h[1], _EDGE_PX):
-            missed[layer] += _shines(scene, R, t, c)
+        elif light_row(problem.lens, R, t, problem.p[c], h) and inside(problem.lens, h[0], h[1], EDGE_PX):
+            missed[layer] += faces(R, t, problem.p[c], problem.axis[c])
     for k in range(layers):
-        miss = missed[k] * math.log(1.0 - q[DETECT])
+        miss = missed[k] * math.log(1.0 - rules.detect)
         if matched[k] == 0 and missed[k] > 0:
-            miss = math.log(q[ABSENT] + (1.0 - q[ABSENT]) * math.exp(miss))
+            miss = math.log(rules.absent + (1.0 - rules.absent) * math.exp(miss))
         total += miss
     return total
 
 
 @part
-def _shines(scene: Scene, R: Array, t: Array, c: int) -> bool:
-    """Whether light `c` sends its light toward the camera, which stands at -R^T t."""
-    norm, along = 0.0, 0.0
-    for k in range(3):
-        away = -(R[0, k] * t[0] + R[1, k] * t[1] + R[2, k] * t[2]) - scene.p[c, k]
-        norm += away * away
-        along += away * scene.axis[c, k]
-    return along > _SHINES * math.sqrt(norm)
+def evidence(one: Candidate, problem: Problem, steps: int, H: Array, L: Array) -> float:
+    """Log evidence of an association whose pose is solved anew, in place, under the whole attitude prior.
 
-
-@part
-def evidence(one: Naming, scene: Scene, steps: int, H: Array, L: Array) -> float:
-    """Log evidence of a naming whose pose is solved anew, in place, under the whole attitude prior.
-
-    The prior is a mixture: a share `STEADY` of vehicles holds its attitude as `scene.steady` says. The pose and the
+    The prior is a mixture: a share `steady` of vehicles holds its attitude as `problem.steady` says. The pose and the
     normal matrix `H` are those under the wide part, unless it leads to another solution that is out of the question.
     """
-    wide = solved(one, scene, scene.info, steps, H, L)
-    steady = scene.q[STEADY]
+    wide = solved(one, problem, problem.info, steps, H, L)
+    steady = problem.rules.steady
     if steady <= 0.0 or wide <= -HUGE:
         return wide
     held, H_held = copied(one), np.empty((6, 6))
-    narrow = solved(held, scene, scene.steady, steps, H_held, L)
+    narrow = solved(held, problem, problem.steady, steps, H_held, L)
     if narrow > wide + _ELSEWHERE:
         put(one, held)
         for k in range(6):
@@ -170,9 +195,9 @@ def evidence(one: Naming, scene: Scene, steps: int, H: Array, L: Array) -> float
 
 
 @part
-def solved(one: Naming, scene: Scene, info: Array, steps: int, H: Array, L: Array) -> float:
-    """Log evidence of a naming whose pose is solved anew, in place, under an attitude prior of `info` (3,)."""
-    return log_evidence(one, scene, info, fit(one, scene, info, steps, H, L))
+def solved(one: Candidate, problem: Problem, info: Array, steps: int, H: Array, L: Array) -> float:
+    """Log evidence of an association whose pose is solved anew, in place, under an attitude prior of `info` (3,)."""
+    return log_evidence(one, problem, info, fit(one, problem, info, steps, H, L))
 
 
 @part
@@ -197,67 +222,30 @@ def innovation(h: Array, P: Array, extra: float, S: Array) -> None:
 
 
 @part
-def named(name: Indices) -> int:
-    """How many lights a naming names."""
+def n_assigned(assignment: Indices) -> int:
+    """How many lights have a detection."""
     n = 0
-    for c in range(len(name)):
-        n += name[c] >= 0
+    for c in range(len(assignment)):
+        n += assignment[c] >= 0
     return n
 
 
 @part
-def named_lights(name: Indices) -> Indices:
-    """The lights (K,) that a naming names."""
-    lights, n = np.empty(named(name), np.int64), 0
-    for c in range(len(name)):
-        if name[c] >= 0:
+def assigned_lights(assignment: Indices) -> Indices:
+    """The lights (K,) that have a detection."""
+    lights, n = np.empty(n_assigned(assignment), np.int64), 0
+    for c in range(len(assignment)):
+        if assignment[c] >= 0:
             lights[n] = c
             n += 1
     return lights
 
 
 @part
-def named_points(name: Indices, p: Array) -> Array:
-    """Positions (K, 3) of the lights that a naming names."""
-    lights = named_lights(name)
+def assigned_points(assignment: Indices, p: Array) -> Array:
+    """Positions (K, 3) of the lights that have a detection."""
+    lights = assigned_lights(assignment)
     points = np.empty((len(lights), 3))
     for k in range(len(lights)):
         copy_to(p[lights[k]], points[k])
     return points
-
-
-@entry
-def weigh(
-    uv: Array,
-    radius: Array,
-    p_rear: Array,
-    is_rear: Indices,
-    trust: float,
-    strange: tuple[float, float, float],
-    cov: Array,
-    p_light: Array,
-    like: Array,
-    var: Array,
-) -> float:
-    """Fill `like` (N, L), softened log likelihood ratios, and `var` (N,) px^2 per axis; the area px^2 of all spots.
-
-    `p_light` (N,) becomes 1 where it is NaN. `cov` (N, 2, 2) grows by a `strange` share of the radius, or of its bound,
-    where `p_light` is less than this much.
-    """
-    low_u, high_u, low_v, high_v = np.inf, -np.inf, np.inf, -np.inf
-    layers, (share, most, usual) = len(is_rear), strange
-    for i in range(len(uv)):
-        if math.isnan(p_light[i]):
-            p_light[i] = 1.0
-        own = radius[i] if radius[i] < most else most
-        wider = (share * max(1.0 - p_light[i] / usual, 0.0) * own) ** 2
-        cov[i, 0, 0] += wider
-        cov[i, 1, 1] += wider
-        low_u, high_u = min(low_u, uv[i, 0]), max(high_u, uv[i, 0])
-        low_v, high_v = min(low_v, uv[i, 1]), max(high_v, uv[i, 1])
-        var[i] = 0.5 * (cov[i, 0, 0] + cov[i, 1, 1])
-        lamp = math.log(min(max(2.0 * p_light[i], 0.05), 1.0))
-        p = 0.5 if math.isnan(p_rear[i]) or layers == 1 else 0.5 + trust * (p_rear[i] - 0.5)
-        for k in range(layers):
-            like[i, k] = lamp + math.log(2.0 * (p if is_rear[k] == 1 or layers == 1 else 1.0 - p))
-    return (high_u - low_u) * (high_v - low_v)

@@ -1,4 +1,4 @@
-"""Which detections lie in the gates of lights that have no name yet."""
+"""Which detections lie in the gates of lights that have no detection yet."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from lumidock._kernels import constant
 from lumidock._kernels.compiling import part
 from lumidock._kernels.lens import copy_to
-from lumidock._kernels.matching.evidence import HUGE, Naming, Scene, innovation, survey_var
+from lumidock._kernels.matching.evidence import HUGE, Candidate, Problem, innovation, survey_var
 from lumidock._kernels.pose import light_row
 from lumidock.datatypes import Array, Indices
 
@@ -18,53 +18,55 @@ ANY = constant(-1)  # layer; or rank that all lights come after
 _NEAR = 2.0  # gates within which a detection may still come to lie in its gate
 
 
-class Sight(NamedTuple):
-    """Where lights are expected under a pose of covariance `P` (6, 6).
+class Expected(NamedTuple):
+    """Pixels predicted for lights from a pose of covariance `P` (6, 6).
 
     Pixel and Jacobian `rows` (M, 14), `S` (M, 3) covariance px^2 without that of a detection, `extra` (M,) px^2 the
-    share of it that the pose has no part in, `there` (M,) which lights are to be found.
+    share of it that the pose has no part in, `sought` (M,) which lights have a detection to be found.
     """
 
     rows: Array
     S: Array
     extra: Array
-    there: np.ndarray
+    sought: np.ndarray
     P: Array
 
 
 @part
-def new_sight(m: int) -> Sight:
-    """Room for `m` lights, none of which is to be found."""
-    return Sight(np.empty((m, 14)), np.empty((m, 3)), np.empty(m), np.zeros(m, np.bool_), np.empty((6, 6)))
+def new_expected(m: int) -> Expected:
+    """Room for `m` lights, none of which is sought."""
+    return Expected(np.empty((m, 14)), np.empty((m, 3)), np.empty(m), np.zeros(m, np.bool_), np.empty((6, 6)))
 
 
 @part
-def look(allowed: int, one: Naming, scene: Scene, sight: Sight) -> None:
-    """Where the unnamed lights of layer `allowed` (-1: any) are expected; fills all of `sight` but `P`."""
-    rows, S, extra, there = sight.rows, sight.S, sight.extra, sight.there
-    name, R, t = one
-    for c in range(len(name)):
-        there[c] = name[c] < 0 and (allowed < 0 or scene.layer[c] == allowed)
-        if there[c]:
-            there[c] = light_row(scene.lens, R, t, scene.p[c], rows[c])
-        if there[c]:
-            extra[c] = survey_var(scene.lens, R, t, scene.p[c], scene.survey_m2[c])
-            innovation(rows[c], sight.P, extra[c], S[c])
+def expect(allowed: int, one: Candidate, problem: Problem, expected: Expected) -> None:
+    """Predict the pixels of lights without a detection, of layer `allowed` or any (-1); fills `expected` but `P`."""
+    rows, S, extra, sought = expected.rows, expected.S, expected.extra, expected.sought
+    assignment, R, t = one
+    for c in range(len(assignment)):
+        sought[c] = assignment[c] < 0 and (allowed < 0 or problem.layer[c] == allowed)
+        if sought[c]:
+            sought[c] = light_row(problem.lens, R, t, problem.p[c], rows[c])
+        if sought[c]:
+            extra[c] = survey_var(problem.lens, R, t, problem.p[c], problem.survey_m2[c])
+            innovation(rows[c], expected.P, extra[c], S[c])
 
 
 @part
-def cheapest(after: int, sight: Sight, taken: Indices, scene: Scene, gate: float, out: Array) -> tuple[int, int]:
-    """The lights in sight that rank after `after` and have a free detection inside their gate, cheapest first.
+def cheapest(
+    after: int, expected: Expected, taken: Indices, problem: Problem, gate: float, out: Array
+) -> tuple[int, int]:
+    """The lights sought that rank after `after` and have a free detection inside their gate, cheapest first.
 
     Fills rows of `out` (K, 3) with NIS + log det S - 2 log likelihood, light and detection; returns how many, and how
     many lights have a detection not far outside their gate.
     """
-    rank, layer, uv, var, like = scene.rank, scene.layer, scene.uv, scene.var, scene.like
+    rank, layer, uv, var, like = problem.rank, problem.layer, problem.uv, problem.var, problem.like
     found, near = 0, 0
     for c in range(len(layer)):
-        if not sight.there[c] or rank[c] <= after:
+        if not expected.sought[c] or rank[c] <= after:
             continue
-        u, v, S, least = sight.rows[c, 0], sight.rows[c, 1], sight.S[c], HUGE
+        u, v, S, least = expected.rows[c, 0], expected.rows[c, 1], expected.S[c], HUGE
         for i in range(len(uv)):
             if taken[i] >= 0:
                 continue
@@ -100,21 +102,23 @@ def _insert(out: Array, found: int, price: float, c: int, i: int) -> int:
 
 
 @part
-def support(c: int, i: int, sight: Sight, taken: Indices, scene: Scene, var: Array, loosest: float, gate: float) -> int:
-    """How many other lights of the layer in sight find a free detection once `i` is named after light `c`.
+def support(
+    c: int, i: int, expected: Expected, taken: Indices, problem: Problem, var: Array, loosest: float, gate: float
+) -> int:
+    """How many other lights sought in the layer find a free detection once detection `i` is given to light `c`.
 
     By one linear update of the pose and its covariance. `var` (N,) px^2 of the detections, `loosest` the largest.
     """
-    rows, layer, uv, by_u = sight.rows, scene.layer, scene.uv, scene.by_u
+    rows, layer, uv, by_u = expected.rows, problem.layer, problem.uv, problem.by_u
     row, S, P2, shift, found = rows[c], np.empty(3), np.empty((6, 6)), np.empty(6), 0
-    S[0], S[1], S[2] = sight.S[c, 0] + scene.var[i], sight.S[c, 1], sight.S[c, 2] + scene.var[i]
-    _condition(row, sight.P, S, uv[i, 0] - row[0], uv[i, 1] - row[1], P2, shift)
+    S[0], S[1], S[2] = expected.S[c, 0] + problem.var[i], expected.S[c, 1], expected.S[c, 2] + problem.var[i]
+    _condition(row, expected.P, S, uv[i, 0] - row[0], uv[i, 1] - row[1], P2, shift)
     taken[i] = c
     for other in range(len(layer)):
-        if other == c or not sight.there[other] or layer[other] != layer[c]:
+        if other == c or not expected.sought[other] or layer[other] != layer[c]:
             continue
         row = rows[other]
-        innovation(row, P2, sight.extra[other], S)
+        innovation(row, P2, expected.extra[other], S)
         u, v = row[0], row[1]
         for k in range(6):
             u += row[2 + k] * shift[k]

@@ -1,4 +1,4 @@
-"""Growing a naming: light after light, the cheapest first, within a layer and beyond it."""
+"""Growing an association: light after light, the cheapest first, within a layer and beyond it."""
 
 from __future__ import annotations
 
@@ -10,90 +10,89 @@ from lumidock._kernels import constant
 from lumidock._kernels.compiling import part
 from lumidock._kernels.lens import copy_to, invert6
 from lumidock._kernels.matching.evidence import (
-    GATE,
     HUGE,
     STEPS,
-    Naming,
-    Scene,
+    Candidate,
+    Problem,
+    assigned_points,
     copied,
     fit,
     keep,
     log_evidence,
-    named,
-    named_points,
+    n_assigned,
     put,
     solved,
 )
-from lumidock._kernels.matching.gates import ANY, Sight, cheapest, look, new_sight, support
+from lumidock._kernels.matching.gates import ANY, Expected, cheapest, expect, new_expected, support
 from lumidock._kernels.pose import SAME_TURN, flip, turn
 from lumidock.datatypes import Array, Indices
 
-NONE = constant(0)  # as the least that must be named
+NONE = constant(0)  # as the least that must be assigned
 _STEPS_MORE, _STEPS_FAR = constant(4), constant(12)  # after one light more; from a pose that may be far off
 _BRANCHES, _FIRSTS = 2, 48  # first lights of another layer tried, of so many looked at
 _HOPELESS = 30.0  # log evidence; a flipped pose this far behind is not followed
 
 
 @part
-def grow(allowed: int, one: Naming, taken: Indices, scene: Scene, least: int) -> tuple[float, float, float]:
-    """Name light after light of layer `allowed` (-1: any), the cheapest first, solving the pose anew after each.
+def grow(allowed: int, one: Candidate, taken: Indices, problem: Problem, least: int) -> tuple[float, float, float]:
+    """Assign light after light of layer `allowed` (-1: any), the cheapest first, and solve the pose after each.
 
-    Works in place; returns what `fit` does, NaN once `least` named lights are out of reach.
+    Works in place; returns what `fit` does, NaN once `least` assigned lights are out of reach.
     """
-    info, gate = scene.info, scene.q[GATE]
-    H, L, sight, out = np.empty((6, 6)), np.empty((6, 6)), new_sight(len(one.name)), np.empty((1, 3))
-    fitted = fit(one, scene, info, STEPS, H, L)
-    for _ in range(len(one.name)):
-        if math.isnan(fitted[1]) or math.isnan(invert6(H, L, sight.P)):
+    info, gate = problem.info, problem.rules.gate
+    H, L, expected, out = np.empty((6, 6)), np.empty((6, 6)), new_expected(len(one.assignment)), np.empty((1, 3))
+    fitted = fit(one, problem, info, STEPS, H, L)
+    for _ in range(len(one.assignment)):
+        if math.isnan(fitted[1]) or math.isnan(invert6(H, L, expected.P)):
             return np.nan, np.nan, 0.0
-        look(allowed, one, scene, sight)
-        found, near = cheapest(ANY, sight, taken, scene, gate, out)
-        if named(one.name) + near < least:
+        expect(allowed, one, problem, expected)
+        found, near = cheapest(ANY, expected, taken, problem, gate, out)
+        if n_assigned(one.assignment) + near < least:
             return np.nan, np.nan, 0.0
         if not found:
             break
         c, i = int(out[0, 1]), int(out[0, 2])
-        one.name[c], taken[i] = i, c
-        fitted = fit(one, scene, info, _STEPS_MORE, H, L)
+        one.assignment[c], taken[i] = i, c
+        fitted = fit(one, problem, info, _STEPS_MORE, H, L)
     return fitted
 
 
 @part
-def extend(one: Naming, taken: Indices, scene: Scene) -> float:
+def extend(one: Candidate, taken: Indices, problem: Problem) -> float:
     """Extend a hypothesis of one layer to all, in place, over both poses of the plane and the first light beyond it.
 
     Growing greedily picks wrong where the tilt is open, so several first lights are tried. Returns the log evidence.
     """
-    best, best_one, info, gate = -HUGE, copied(one), scene.info, scene.q[GATE]
+    best, best_one, info, gate = -HUGE, copied(one), problem.info, problem.rules.gate
     out, tops = np.empty((_FIRSTS, 3)), np.empty((_BRANCHES, 2))
-    H, L, sight = np.empty((6, 6)), np.empty((6, 6)), new_sight(len(one.name))
+    H, L, expected = np.empty((6, 6)), np.empty((6, 6)), new_expected(len(one.assignment))
     for mode in range(2):
         start = copied(one)
         if mode == 1:
-            flip(named_points(start.name, scene.p), start.R, start.t)
-        e = solved(start, scene, info, _STEPS_FAR, H, L)
+            flip(assigned_points(start.assignment, problem.p), start.R, start.t)
+        e = solved(start, problem, info, _STEPS_FAR, H, L)
         if mode == 1 and (e < best - _HOPELESS or turn(start.R, one.R) < SAME_TURN):
             break
         if mode == 0:
             put(one, start)
         best = keep(e, best, start, best_one)
-        if e <= -HUGE or math.isnan(invert6(H, L, sight.P)):
+        if e <= -HUGE or math.isnan(invert6(H, L, expected.P)):
             continue
-        look(ANY, start, scene, sight)
-        found, _ = cheapest(ANY, sight, taken, scene, gate, out)
-        for k in range(_most_supported(out, found, sight, taken, scene, gate, tops)):
+        expect(ANY, start, problem, expected)
+        found, _ = cheapest(ANY, expected, taken, problem, gate, out)
+        for k in range(_most_supported(out, found, expected, taken, problem, gate, tops)):
             trial, held = copied(start), taken.copy()
             c, i = int(out[int(tops[k, 1]), 1]), int(out[int(tops[k, 1]), 2])
-            trial.name[c], held[i] = i, c
-            fitted = grow(ANY, trial, held, scene, NONE)
-            best = keep(log_evidence(trial, scene, info, fitted), best, trial, best_one)
+            trial.assignment[c], held[i] = i, c
+            fitted = grow(ANY, trial, held, problem, NONE)
+            best = keep(log_evidence(trial, problem, info, fitted), best, trial, best_one)
     put(one, best_one)
     return best
 
 
 @part
 def _most_supported(
-    out: Array, found: int, sight: Sight, taken: Indices, scene: Scene, gate: float, tops: Array
+    out: Array, found: int, expected: Expected, taken: Indices, problem: Problem, gate: float, tops: Array
 ) -> int:
     """Which first lights of another layer, rows of `out`, have most support there; into `tops`, best first.
 
@@ -102,7 +101,7 @@ def _most_supported(
     kept, var = 0, np.ones(len(taken))
     for k in range(found):
         c, i = int(out[k, 1]), int(out[k, 2])
-        worth = support(c, i, sight, taken, scene, var, 1.0, 2.0 * gate) - 1e-3 * out[k, 0]
+        worth = support(c, i, expected, taken, problem, var, 1.0, 2.0 * gate) - 1e-3 * out[k, 0]
         if kept < len(tops):
             kept += 1
         elif worth <= tops[kept - 1, 0]:

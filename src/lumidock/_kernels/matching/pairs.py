@@ -1,4 +1,4 @@
-"""Poses from two named lights and the expected attitude, and what else is in place under them."""
+"""Poses from two assigned lights and the expected attitude, and which other lights are in place under them."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 from lumidock._kernels.compiling import part
 from lumidock._kernels.lens import invert6
-from lumidock._kernels.matching.evidence import BEND, FAR_M, NEAR_M, PAIR_GATE, ROLL_GATE, Scene, innovation, survey_var
-from lumidock._kernels.matching.gates import Sight, occupied
+from lumidock._kernels.matching.evidence import Problem, SearchRules, innovation, survey_var
+from lumidock._kernels.matching.gates import Expected, occupied
 from lumidock._kernels.pose import light_row
 from lumidock.datatypes import Array, Indices
 
 
 class Pair(NamedTuple):
-    """Lights `a` and `b` named `i` and `j`, with the depth `z` m of `a` and the roll rad that this leads to."""
+    """Detections `i` and `j` of lights `a` and `b`, with the depth `z` m of `a` and the roll rad that this leads to."""
 
     a: int
     b: int
@@ -26,32 +26,32 @@ class Pair(NamedTuple):
     roll: float
 
 
-class View(NamedTuple):
+class PairPose(NamedTuple):
     """A pose of which two pixels and the expected attitude are known.
 
-    Of each detection the light, `taken` (N,) or -1, and the pose `R`, `t`. `open` (3, 6) is the information of the
-    prior; `H` and `L` (6, 6) are work space.
+    Of each detection the light, `taken` (N,) or -1, and the pose `R`, `t`. `prior_info` (3, 6) is the information of
+    the prior; `H` and `L` (6, 6) are work space.
     """
 
     taken: Indices
     R: Array
     t: Array
-    open: Array
+    prior_info: Array
     H: Array
     L: Array
 
 
 @part
-def new_view(scene: Scene) -> View:
-    """Room for a view in which no detection is taken yet."""
-    taken = np.full(len(scene.uv), -1, np.int64)
+def new_pair_pose(problem: Problem) -> PairPose:
+    """Room for a pose under which no detection is taken yet."""
+    taken = np.full(len(problem.uv), -1, np.int64)
     open_ = np.zeros((3, 6))
-    _open_attitude(scene, open_)
-    return View(taken, np.empty((3, 3)), np.empty(3), open_, np.empty((6, 6)), np.empty((6, 6)))
+    _open_attitude(problem, open_)
+    return PairPose(taken, np.empty((3, 3)), np.empty(3), open_, np.empty((6, 6)), np.empty((6, 6)))
 
 
 @part
-def _open_attitude(scene: Scene, open_: Array) -> None:
+def _open_attitude(problem: Problem, open_: Array) -> None:
     """Add the information (3, 6) that the attitude prior has of a pose; of rotation, the last three columns.
 
     At the expected attitude its Jacobian is, whatever the roll, -y, x and -z of `cam` in dock axes.
@@ -60,36 +60,36 @@ def _open_attitude(scene: Scene, open_: Array) -> None:
         axis = 1 - m if m < 2 else 2
         for k in range(3):
             for o in range(3):
-                open_[k, 3 + o] += scene.info[m] * scene.Rp[k, axis] * scene.Rp[o, axis]
+                open_[k, 3 + o] += problem.info[m] * problem.Rp[k, axis] * problem.Rp[o, axis]
 
 
 @part
 def pair_poses(
-    a: int, b: int, least: int, scene: Scene, view: View, sight: Sight, budget: Indices, tries: Array
+    a: int, b: int, least: int, problem: Problem, pose: PairPose, expected: Expected, budget: Indices, tries: Array
 ) -> int:
     """All pairs of detections that lights `a` and `b` may have made.
 
     Fills rows of `tries`: how many other lights of the layer are in place, the two detections, depth of `a`, and roll.
     Pairs with fewer than `least` in place are left out, and all that exceed the `budget` (1,). Returns how many rows.
     """
-    n, found, taken = len(scene.uv), 0, view.taken
+    n, found, taken = len(problem.uv), 0, pose.taken
     d, sols = np.empty(3), np.empty((2, 2))
     for k in range(3):  # R_cam_dock of the prior is Rp^T
         d[k] = 0.0
         for o in range(3):
-            d[k] += scene.Rp[o, k] * (scene.p[b, o] - scene.p[a, o])
+            d[k] += problem.Rp[o, k] * (problem.p[b, o] - problem.p[a, o])
     for i in range(n):
         for j in range(n):
-            if i == j or not (scene.ray[i, 2] > 0.0 and scene.ray[j, 2] > 0.0):
+            if i == j or not (problem.ray[i, 2] > 0.0 and problem.ray[j, 2] > 0.0):
                 continue
-            for sol in range(_pair_pose(d, scene.ray[i], scene.ray[j], scene.q, sols)):
+            for sol in range(_pair_pose(d, problem.ray[i], problem.ray[j], problem.rules, sols)):
                 budget[0] -= 1
                 if budget[0] < 0:
                     return found
                 pair = Pair(a, b, i, j, sols[sol, 0], sols[sol, 1])
-                know_pair(pair, scene, view, sight.rows[a], sight.P)
+                know_pair(pair, problem, pose, expected.rows[a], expected.P)
                 taken[i], taken[j] = a, b
-                support = in_place(pair, least, scene, view, sight)
+                support = in_place(pair, least, problem, pose, expected)
                 taken[i], taken[j] = -1, -1
                 if support >= least:
                     tries[found, 0], tries[found, 1], tries[found, 2] = support, i, j
@@ -99,7 +99,7 @@ def pair_poses(
 
 
 @part
-def _pair_pose(d: Array, ray_i: Array, ray_j: Array, q: Array, out: Array) -> int:
+def _pair_pose(d: Array, ray_i: Array, ray_j: Array, rules: SearchRules, out: Array) -> int:
     """Depth of the first light and roll that put two lights `d` (3,) apart in the prior's `cam` axes on two rays.
 
     Fills up to two rows of `out` (2, 2); returns how many lie within the gates.
@@ -117,11 +117,11 @@ def _pair_pose(d: Array, ray_i: Array, ray_j: Array, q: Array, out: Array) -> in
     found = 0
     for sign in (1.0, -1.0):
         z = (-B + sign * root) / A
-        if not q[NEAR_M] < z < q[FAR_M] or z + d[2] < q[NEAR_M]:
+        if not rules.near_m < z < rules.far_m or z + d[2] < rules.near_m:
             continue
         ex, ey = z * dx + d[2] * xj, z * dy + d[2] * yj
         roll = math.atan2(d[0] * ey - d[1] * ex, d[0] * ex + d[1] * ey)
-        if abs(roll) > q[ROLL_GATE]:
+        if abs(roll) > rules.roll_gate:
             continue
         out[found, 0], out[found, 1] = z, roll
         found += 1
@@ -129,23 +129,23 @@ def _pair_pose(d: Array, ray_i: Array, ray_j: Array, q: Array, out: Array) -> in
 
 
 @part
-def know_pair(pair: Pair, scene: Scene, view: View, h: Array, P: Array) -> None:
-    """Pose, in `view`, and covariance `P` (6, 6) of two named lights and the expected attitude; `h` (14,) is spare."""
+def know_pair(pair: Pair, problem: Problem, pose: PairPose, h: Array, P: Array) -> None:
+    """Fill `pose` and its covariance `P` (6, 6) from two lights and the expected attitude; `h` (14,) is work space."""
     a, b, i, j, z, roll = pair
-    R, t = view.R, view.t
-    _pose_of(scene.Rp, roll, z, scene.ray[i], scene.p[a], R, t)
-    H = view.H
+    R, t = pose.R, pose.t
+    _pose_of(problem.Rp, roll, z, problem.ray[i], problem.p[a], R, t)
+    H = pose.H
     for m in range(3):
         for o in range(6):
-            H[m, o], H[3 + m, o] = 0.0, view.open[m, o]
+            H[m, o], H[3 + m, o] = 0.0, pose.prior_info[m, o]
     for k in range(2):
         c, d = (a, i) if k == 0 else (b, j)
-        if light_row(scene.lens, R, t, scene.p[c], h):
-            w = 1.0 / (scene.var[d] + survey_var(scene.lens, R, t, scene.p[c], scene.survey_m2[c]))
+        if light_row(problem.lens, R, t, problem.p[c], h):
+            w = 1.0 / (problem.var[d] + survey_var(problem.lens, R, t, problem.p[c], problem.survey_m2[c]))
             for m in range(6):
                 for o in range(m + 1):
                     H[m, o] += w * (h[2 + m] * h[2 + o] + h[8 + m] * h[8 + o])
-    invert6(H, view.L, P)
+    invert6(H, pose.L, P)
 
 
 @part
@@ -161,30 +161,45 @@ def _pose_of(Rp: Array, roll: float, z: float, ray: Array, p: Array, R: Array, t
 
 
 @part
-def in_place(pair: Pair, least: int, scene: Scene, view: View, sight: Sight) -> int:
-    """How many other lights of the layer have a free detection in their gate; fills the `sight` with where they are.
+def in_place(pair: Pair, least: int, problem: Problem, pose: PairPose, expected: Expected) -> int:
+    """How many other lights of the layer have a free detection in their gate; fills `expected` with where they are.
 
     Ends early where `least` can no longer be reached. One function with its arrays at hand: it is half of all work.
     """
-    loosest, by_u = scene.loosest, scene.by_u
-    lens, p, layer, survey_m2, uv, var = scene.lens, scene.p, scene.layer, scene.survey_m2, scene.uv, scene.var
-    rows, there, extra, P, R, t, taken = sight.rows, sight.there, sight.extra, sight.P, view.R, view.t, view.taken
-    gate, bend, a, b = scene.q[PAIR_GATE], scene.q[BEND], pair.a, pair.b
+    loosest, by_u = problem.loosest, problem.by_u
+    lens, p, layer, survey_m2, uv, var = (
+        problem.lens,
+        problem.p,
+        problem.layer,
+        problem.survey_m2,
+        problem.uv,
+        problem.var,
+    )
+    rows, sought, extra, P, R, t, taken = (
+        expected.rows,
+        expected.sought,
+        expected.extra,
+        expected.P,
+        pose.R,
+        pose.t,
+        pose.taken,
+    )
+    gate, bend, a, b = problem.rules.pair_gate, problem.rules.bend, pair.a, pair.b
     mu, mv = 0.5 * (uv[pair.i, 0] + uv[pair.j, 0]), 0.5 * (uv[pair.i, 1] + uv[pair.j, 1])
     support, left = 0, -2
     for c in range(len(p)):
         left += layer[c] == layer[a]
     for c in range(len(p)):
-        there[c] = False
+        sought[c] = False
         if c == a or layer[c] != layer[a] or c == b:  # noqa: SIM109 - slow in numba
             continue
         if support + left < least:
             break
         left -= 1
-        h, S = rows[c], sight.S[c]
+        h, S = rows[c], expected.S[c]
         if not light_row(lens, R, t, p[c], h):
             continue
-        there[c] = True
+        sought[c] = True
         du, dv = h[0] - mu, h[1] - mv
         extra[c] = survey_var(lens, R, t, p[c], survey_m2[c]) + bend * (du * du + dv * dv)
         innovation(h, P, extra[c], S)

@@ -1,8 +1,9 @@
-"""Hypotheses next to a given one: its other pose, and all namings one relabelling away."""
+"""Hypotheses next to a given one: its other pose, and all associations one relabelling away."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,19 +11,17 @@ from lumidock._kernels import constant
 from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.lens import invert6
 from lumidock._kernels.matching.evidence import (
-    GATE,
     HUGE,
-    STEADY,
     STEPS,
-    Naming,
-    Scene,
+    Candidate,
+    Problem,
+    assigned_points,
     copied,
     evidence,
     innovation,
     keep,
     log_add,
-    named,
-    named_points,
+    n_assigned,
     put,
     solved,
     survey_var,
@@ -33,30 +32,41 @@ from lumidock._kernels.pose import SAME_TURN, flip, light_row, turn
 from lumidock.datatypes import Array, Indices
 
 _STEPS_OTHER, _STEPS_EXCHANGED = constant(20), constant(8)
-_FAR_GATES = 4.0  # gates within which another name is tried
+_FAR_GATES = 4.0  # gates within which another assignment is tried
+
+
+class Doubt(NamedTuple):
+    """What speaks against each assigned light of a hypothesis.
+
+    `without` (M,): log evidence with its detection left out as clutter. `against` (M,): log of the summed evidence of
+    the relabellings that give the light another detection, or none, or its detection to another light.
+    """
+
+    without: Array
+    against: Array
 
 
 @entry
-def other_pose(one: Naming, scene: Scene, level: bool, other: Naming) -> float:
-    """Fill `other`, another pose that fits the same names; its log evidence, hugely negative where there is but one.
+def other_pose(one: Candidate, problem: Problem, level: bool, other: Candidate) -> float:
+    """Fill `other`, another pose that fits the same assignment; its log evidence, hugely negative where there is none.
 
     Found from the flipped pose, or, with `level`, from the expected attitude: lights off the axis leave two solutions
     whose tilts are not opposite. Where the steady part of the prior leads back to the first pose, it counts there.
     """
     H, L = np.empty((6, 6)), np.empty((6, 6))
-    p, steady = named_points(one.name, scene.p), scene.q[STEADY]
+    p, steady = assigned_points(one.assignment, problem.p), problem.rules.steady
     put(other, one)
     if level:
-        _levelled(p, scene.Rp, other.R, other.t)
+        _levelled(p, problem.Rp, other.R, other.t)
     else:
         flip(p, other.R, other.t)
-    wide = solved(other, scene, scene.info, _STEPS_OTHER, H, L)
+    wide = solved(other, problem, problem.info, _STEPS_OTHER, H, L)
     if wide <= -HUGE or turn(one.R, other.R) < SAME_TURN:
         return -HUGE
     if steady <= 0.0:
         return wide
     held = copied(other)
-    narrow = solved(held, scene, scene.steady, _STEPS_OTHER, H, L) + math.log(steady)
+    narrow = solved(held, problem, problem.steady, _STEPS_OTHER, H, L) + math.log(steady)
     wide += math.log(1.0 - steady)
     return log_add(wide, narrow) if turn(one.R, held.R) > turn(other.R, held.R) else wide
 
@@ -88,39 +98,39 @@ def _levelled(p: Array, Rp: Array, R: Array, t: Array) -> None:
 
 
 @entry
-def rivals(one: Naming, taken: Indices, scene: Scene, without: Array, against: Array, better: Naming) -> float:
+def rivals(one: Candidate, taken: Indices, problem: Problem, doubt: Doubt, better: Candidate) -> float:
     """Hypotheses one relabelling away, each solved anew.
 
     A detection left out, with others added where they then fit; another detection for a light; another light for a
-    detection; two lights exchanged. Fills `without` (M,), the log evidence that leaves a light's detection out;
-    `against` (M,), the log mass of those that name a light otherwise; and the best of all, `better`, whose log
-    evidence it returns.
+    detection; two lights exchanged. Fills `doubt`, and the best of all, `better`, whose log evidence it returns.
     """
-    best = -HUGE
+    best, without, against = -HUGE, doubt.without, doubt.against
     H, L, P = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    for c in range(len(one.name)):
+    for c in range(len(one.assignment)):
         without[c] = against[c] = -HUGE
-    for c in range(len(one.name)):
-        if one.name[c] < 0:
+    for c in range(len(one.assignment)):
+        if one.assignment[c] < 0:
             continue
         less = copied(one)
-        less.name[c] = -1
-        without[c] = evidence(less, scene, STEPS, H, L)
+        less.assignment[c] = -1
+        without[c] = evidence(less, problem, STEPS, H, L)
         best = keep(without[c], best, less, better)
-        best = _regrown(c, less, taken, scene, against, best, better)
+        best = _regrown(c, less, taken, problem, against, best, better)
         if without[c] > -HUGE and not math.isnan(invert6(H, L, P)):
-            best = _exchanged(c, one.name, less, taken, scene, P, against, best, better)
+            best = _exchanged(c, one.assignment, less, taken, problem, P, against, best, better)
     return best
 
 
 @part
-def _regrown(c: int, less: Naming, taken: Indices, scene: Scene, against: Array, best: float, better: Naming) -> float:
-    """Without the name of light `c` others may find their place."""
+def _regrown(
+    c: int, less: Candidate, taken: Indices, problem: Problem, against: Array, best: float, better: Candidate
+) -> float:
+    """Without the detection of light `c` others may find their place."""
     grown, H, L = copied(less), np.empty((6, 6)), np.empty((6, 6))
-    grow(ANY, grown, taken.copy(), scene, NONE)
-    if named(grown.name) <= named(less.name):
+    grow(ANY, grown, taken.copy(), problem, NONE)
+    if n_assigned(grown.assignment) <= n_assigned(less.assignment):
         return best
-    e = evidence(grown, scene, STEPS, H, L)
+    e = evidence(grown, problem, STEPS, H, L)
     against[c] = log_add(against[c], e)
     return keep(e, best, grown, better)
 
@@ -128,34 +138,34 @@ def _regrown(c: int, less: Naming, taken: Indices, scene: Scene, against: Array,
 @part
 def _exchanged(
     c: int,
-    name: Indices,
-    less: Naming,
+    assignment: Indices,
+    less: Candidate,
     taken: Indices,
-    scene: Scene,
+    problem: Problem,
     P: Array,
     against: Array,
     best: float,
-    better: Naming,
+    better: Candidate,
 ) -> float:
     """Another detection for light `c`; its detection for an unnamed light; or exchanged with that of a later light.
 
-    `name` (M,) are all names; `less` is without that of `c`, its pose of covariance `P`.
+    `assignment` (M,) is the whole one; `less` is without that of `c`, its pose of covariance `P`.
     """
-    gate = _FAR_GATES * scene.q[GATE]
-    i, h, S = name[c], np.empty(14), np.empty(3)
+    gate = _FAR_GATES * problem.rules.gate
+    i, h, S = assignment[c], np.empty(14), np.empty(3)
     H, L = np.empty((6, 6)), np.empty((6, 6))
-    for c2 in range(len(name)):
-        if (c2 < c and name[c2] >= 0) or not light_row(scene.lens, less.R, less.t, scene.p[c2], h):
+    for c2 in range(len(assignment)):
+        if (c2 < c and assignment[c2] >= 0) or not light_row(problem.lens, less.R, less.t, problem.p[c2], h):
             continue
-        innovation(h, P, survey_var(scene.lens, less.R, less.t, scene.p[c2], scene.survey_m2[c2]), S)
-        for k in range(len(scene.uv)):
+        innovation(h, P, survey_var(problem.lens, less.R, less.t, problem.p[c2], problem.survey_m2[c2]), S)
+        for k in range(len(problem.uv)):
             if (c2 == c and (k == i or taken[k] >= 0)) or (c2 != c and k != i):
                 continue
-            if nis(scene.uv[k, 0] - h[0], scene.uv[k, 1] - h[1], S, scene.var[k])[0] > gate:
+            if nis(problem.uv[k, 0] - h[0], problem.uv[k, 1] - h[1], S, problem.var[k])[0] > gate:
                 continue
-            one, j = copied(less), name[c2]
-            one.name[c], one.name[c2] = j if c2 != c else -1, k
-            e = evidence(one, scene, _STEPS_EXCHANGED, H, L)
+            one, j = copied(less), assignment[c2]
+            one.assignment[c], one.assignment[c2] = j if c2 != c else -1, k
+            e = evidence(one, problem, _STEPS_EXCHANGED, H, L)
             against[c] = log_add(against[c], e)
             if c2 != c and j >= 0:
                 against[c2] = log_add(against[c2], e)

@@ -1,4 +1,4 @@
-"""The most probable namings under a prediction, by a search over all lights together."""
+"""The most probable associations under a prediction, by a search over all lights together."""
 
 from __future__ import annotations
 
@@ -9,68 +9,69 @@ import numpy as np
 
 from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.lens import copy_to
-from lumidock._kernels.tracking.track import Foreseen
+from lumidock._kernels.measurements import Measurements
+from lumidock._kernels.tracking.track import PredictedMeasurements
 from lumidock.datatypes import Array, Indices
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
 class Terms(NamedTuple):
-    """What namings are weighed by.
+    """What associations are weighed by.
 
-    Log density 1/px^2 of spurious spots, the probability that a light is detected, the gate on NIS, how much cost
-    behind the best is still followed, and how many nodes the search may visit.
+    The probability that a light is detected, the gate on NIS, how much cost behind the best is still followed, and how
+    many nodes the search may visit.
     """
 
-    log_clutter: float
     detect: float
     gate: float
     reach: float
     max_nodes: int
 
 
+class Ranking(NamedTuple):
+    """The best K associations: the detection of each light or -1, `assignments` (K, M), and `costs`."""
+
+    assignments: Indices
+    costs: Array
+
+
 @entry
 def associate(
-    foreseen: Foreseen,
-    layer: Indices,
-    uv: Array,
-    var: Array,
-    like: Array,
-    terms: Terms,
-    names: Indices,
-    costs: Array,
+    predicted: PredictedMeasurements, layer: Indices, frame: Measurements, terms: Terms, ranking: Ranking
 ) -> int:
-    """The most probable namings under the prediction, best first: `names` (K, M), `costs` (K,); returns how many.
+    """The most probable associations of a `frame` under the prediction, best first, into `ranking`; returns how many.
 
     It returns -1 where the search would take more than `max_nodes`: a part of it says nothing.
 
-    A depth-first search over the lights, each with the detections in its gate or none; every named light conditions
+    A depth-first search over the lights, each with the detections in its gate or none; every assigned light conditions
     those after it through their joint covariance (J. Neira, J. Tardos, 2001). Costs are -log evidence over "all
-    clutter"; namings more than `reach` behind the best are not followed.
+    clutter"; associations more than `reach` behind the best are not followed.
     """
-    expected, S, shown = foreseen
+    expected, S, shown = predicted
     m = len(shown)
-    log_clutter, detect, gate, reach, max_nodes = terms
-    cand, n_cand = _candidates(foreseen, uv, var, gate)
+    uv, var, like, log_clutter = frame.uv, frame.var, frame.like, frame.log_density
+    detect, gate, reach, max_nodes = terms
+    cand, n_cand = _candidates(predicted, uv, var, gate)
     order, always, miss = _fewest_first(n_cand, len(uv)), 0.0, -math.log(1.0 - detect)
     for c in range(m):
         if n_cand[c] == 0 and shown[c] == 2.0:
             always += miss
-    least, depth = _least(foreseen, order, cand, n_cand, layer, var, like, terms), len(order)
+    least, depth = _least(predicted, order, cand, n_cand, layer, frame, terms), len(order)
     chosen, L, w = np.empty(m, np.int64), np.empty((2 * m, 2 * m)), np.empty(2 * m)
     count, cost, at = np.zeros(m + 1, np.int64), np.zeros(m + 1), np.zeros(m + 1, np.int64)
-    name, taken = np.full(m, -1, np.int64), np.full(len(uv), -1, np.int64)
+    assignment, taken = np.full(m, -1, np.int64), np.full(len(uv), -1, np.int64)
     found, d, nodes, best = 0, 0, 0, np.inf
     while d >= 0:
         if d == depth:
             best = min(best, cost[d])
-            found = _keep(name, cost[d] + always, names, costs, found)
+            found = _keep(assignment, cost[d] + always, ranking, found)
             d -= 1
             continue
         c = order[d]
-        if name[c] >= 0:
-            taken[name[c]] = -1
-            name[c] = -1
+        if assignment[c] >= 0:
+            taken[assignment[c]] = -1
+            assignment[c] = -1
         k = at[d]
         at[d] += 1
         nodes += 1
@@ -87,13 +88,13 @@ def associate(
             i = cand[c, k]
             if taken[i] >= 0:
                 continue
-            price = _name_one(expected, S, L, w, chosen, count[d], c, uv[i], var[i], gate)
+            price = _assign_one(expected, S, L, w, chosen, count[d], c, uv[i], var[i], gate)
             if math.isnan(price):
                 continue
             cost[d + 1] = cost[d] + price + log_clutter - math.log(detect) - like[i, layer[c]]
             chosen[count[d]] = c
             count[d + 1] = count[d] + 1
-            name[c], taken[i] = i, c
+            assignment[c], taken[i] = i, c
         if cost[d + 1] + least[d + 1] > best + reach:
             continue
         d += 1
@@ -102,20 +103,20 @@ def associate(
 
 
 @part
-def _candidates(foreseen: Foreseen, uv: Array, var: Array, gate: float) -> tuple[Indices, Indices]:
+def _candidates(predicted: PredictedMeasurements, uv: Array, var: Array, gate: float) -> tuple[Indices, Indices]:
     """The detections in each light's gate, the likeliest first (M, N), and how many (M,)."""
-    m = len(foreseen.shown)
+    m = len(predicted.shown)
     cand, n_cand = np.empty((m, len(uv)), np.int64), np.zeros(m, np.int64)
     for c in range(m):
-        if foreseen.shown[c] > 0.0:
-            n_cand[c] = _in_gate(foreseen, c, uv, var, gate, cand[c])
+        if predicted.shown[c] > 0.0:
+            n_cand[c] = _in_gate(predicted, c, uv, var, gate, cand[c])
     return cand, n_cand
 
 
 @part
-def _in_gate(foreseen: Foreseen, c: int, uv: Array, var: Array, gate: float, cand: Indices) -> int:
+def _in_gate(predicted: PredictedMeasurements, c: int, uv: Array, var: Array, gate: float, cand: Indices) -> int:
     """The detections in the gate of light `c`, the likeliest first: fills `cand` (N,), returns how many."""
-    S, u, v = foreseen.S, foreseen.expected[c, 0], foreseen.expected[c, 1]
+    S, u, v = predicted.S, predicted.uv[c, 0], predicted.uv[c, 1]
     a, b, d = S[2 * c, 2 * c], S[2 * c, 2 * c + 1], S[2 * c + 1, 2 * c + 1]
     costs, n = np.empty(len(uv)), 0
     for i in range(len(uv)):
@@ -148,38 +149,38 @@ def _fewest_first(n_cand: Indices, most: int) -> Indices:
 
 @part
 def _least(
-    foreseen: Foreseen,
+    predicted: PredictedMeasurements,
     order: Indices,
     cand: Indices,
     n_cand: Indices,
     layer: Indices,
-    var: Array,
-    like: Array,
+    frame: Measurements,
     terms: Terms,
 ) -> Array:
     """The least (D + 1,) that all lights from each depth of `order` on can cost."""
+    var, like = frame.var, frame.like
     depth, miss, sharpest = len(order), -math.log(1.0 - terms.detect), np.inf
     least, narrow = np.zeros(depth + 1), np.empty((depth, 3))
     for i in range(len(var)):
         sharpest = min(sharpest, var[i])
-    _narrowest(foreseen.S, order, sharpest, narrow)
+    _narrowest(predicted.S, order, sharpest, narrow)
     for d in range(depth - 1, -1, -1):
         c = order[d]
-        low = miss if foreseen.shown[c] == 2.0 else 0.0
+        low = miss if predicted.shown[c] == 2.0 else 0.0
         for k in range(n_cand[c]):
             i = cand[c, k]
             det = (narrow[d, 0] + var[i]) * (narrow[d, 2] + var[i]) - narrow[d, 1] ** 2
             price = _LOG_2PI + 0.5 * math.log(max(det, var[i] * var[i]))
-            low = min(low, price - math.log(terms.detect) - like[i, layer[c]] + terms.log_clutter)
+            low = min(low, price - math.log(terms.detect) - like[i, layer[c]] + frame.log_density)
         least[d] = least[d + 1] + low
     return least
 
 
 @part
 def _narrowest(S: Array, order: Indices, var: float, narrow: Array) -> None:
-    """Covariance uu, uv, vv (D, 3) of each light's pixel when all before it in `order` (D,) are named.
+    """Covariance uu, uv, vv (D, 3) of each light's pixel when all before it in `order` (D,) are assigned.
 
-    With fewer of them named it is wider: what it costs to name a light is never less.
+    With fewer of them assigned it is wider: what it costs to assign a light is never less.
     """
     L = np.empty((2 * len(order), 2 * len(order)))
     for k in range(len(order)):
@@ -200,7 +201,7 @@ def _narrowest(S: Array, order: Indices, var: float, narrow: Array) -> None:
 
 
 @part
-def _name_one(
+def _assign_one(
     expected: Array,
     S: Array,
     L: Array,
@@ -212,7 +213,7 @@ def _name_one(
     var: float,
     gate: float,
 ) -> float:
-    """Cost of naming light `c` after a detection, given the `count` `chosen` before; NaN outside the gate.
+    """Cost of giving light `c` a detection, given the `count` `chosen` before; NaN outside the gate.
 
     Adds two rows to the Cholesky factor `L` of the joint covariance and to the whitened innovation `w`.
     """
@@ -247,8 +248,9 @@ def _name_one(
 
 
 @part
-def _keep(name: Indices, cost: float, names: Indices, costs: Array, found: int) -> int:
-    """Put a naming into the sorted list."""
+def _keep(assignment: Indices, cost: float, ranking: Ranking, found: int) -> int:
+    """Put an association into the sorted list; returns how many there are then."""
+    assignments, costs = ranking
     k = len(costs)
     if found == k and cost >= costs[k - 1]:
         return found
@@ -257,8 +259,8 @@ def _keep(name: Indices, cost: float, names: Indices, costs: Array, found: int) 
     at = found - 1
     while at > 0 and costs[at - 1] > cost:
         costs[at] = costs[at - 1]
-        copy_to(names[at - 1], names[at])
+        copy_to(assignments[at - 1], assignments[at])
         at -= 1
     costs[at] = cost
-    copy_to(name, names[at])
+    copy_to(assignment, assignments[at])
     return found

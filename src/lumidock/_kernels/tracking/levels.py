@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.tracking.slant import tilt_of
+from lumidock._kernels.tracking.track import FilterState
 from lumidock.datatypes import Array
 
 _TILT_SIGMAS = 2.5  # of a plane's tilt, for what its square does to the range
+
+
+class SigmaFactors(NamedTuple):
+    """Factors (3,) on sigma, in one, two and three dimensions, without a fault and with one light at fault.
+
+    With `separate` every light may be at fault.
+    """
+
+    fault_free: Array
+    one_fault: Array
+    separate: bool
 
 
 @part
@@ -57,23 +70,16 @@ def _largest3(A: Array) -> float:
 
 
 @entry
-def levels(
-    R: Array,
-    t: Array,
-    P: Array,
-    apart: Array,
-    plane: Array,
-    k_free: Array,
-    k_fault: Array,
-    separate: bool,
-    cov: Array,
+def protection_levels(
+    state: FilterState, separations: Array, plane: Array, factors: SigmaFactors, cov: Array
 ) -> tuple[float, float, float, float, float]:
     """Protection levels: lateral m, axial m, angle rad, bearing rad, range m; `cov` (9, 9) of `outputs` is filled.
 
-    `k_free` and `k_fault` (3,) are the factors on sigma in one, two and three dimensions without a fault and with one
-    light at fault; with `separate` every light of `apart` may be. A tilted `plane` looks smaller by its square: range
-    and axial levels have room for what the tilt's spread can do to them.
+    `separations` (M, 18) as in `update`: what leaving each light out moves, and the variance that it adds. A tilted
+    `plane` (6,) looks smaller by the square of its tilt: range and axial levels have room for what the tilt's spread
+    can do to them.
     """
+    R, t, P, k_free, k_fault = state.R, state.t, state.P, factors.fault_free, factors.one_fault
     C = outputs(R, t)
     for i in range(9):
         for j in range(i + 1):
@@ -86,9 +92,9 @@ def levels(
     bearing, distance = _largest2(cov[6, 6], cov[6, 7], cov[7, 7]), cov[8, 8]
     pl0, pl1, pl2 = k_free[1] * math.sqrt(lateral), k_free[0] * math.sqrt(axial), k_free[2] * math.sqrt(angle)
     pl3, pl4 = k_free[1] * math.sqrt(bearing), k_free[0] * math.sqrt(distance)
-    if separate:
-        for c in range(len(apart)):
-            a = apart[c]
+    if factors.separate:
+        for c in range(len(separations)):
+            a = separations[c]
             if a[9] == 0.0 and a[10] == 0.0:
                 continue
             pl0 = max(pl0, math.hypot(a[0], a[1]) + k_fault[1] * math.sqrt(lateral + a[9] + a[10]))

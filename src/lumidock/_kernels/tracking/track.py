@@ -16,13 +16,24 @@ import numpy as np
 from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.lens import inside, rotate_exp
 from lumidock._kernels.pose import attitude_error, light_row, set_pose
+from lumidock._kernels.visibility import EDGE_PX, faces
 from lumidock.datatypes import Array
 
 TWIST, BIAS, CALIBRATION, LIGHTS = 6, 12, 15, 18
-_MARGIN_PX, _SHINES = 3.0, 0.1
+_SURE_SIGMAS, _POSSIBLE_SIGMAS = 2.0, 5.0  # of its pixel: inside the picture by so many a light should be seen; outside
+# it by more it cannot
+_WINDOW_SIGMAS = 4.0  # reach of a search window: one in 30,000 lights lies outside in one axis
 
 
-class State(NamedTuple):
+class Lights(NamedTuple):
+    """M lights and the lens (16,) that sees them: positions `p` (M, 3) m, beam axes `axis` (M, 3), both in `dock`."""
+
+    lens: Array
+    p: Array
+    axis: Array
+
+
+class FilterState(NamedTuple):
     """Pose `R`, `t` of T_cam_dock, the other states `x` (n,), and the covariance `P` (n, n) of all."""
 
     R: Array
@@ -31,29 +42,33 @@ class State(NamedTuple):
     P: Array
 
 
-class Foreseen(NamedTuple):
-    """Where every light is expected: `expected` (M, 2) px and `S` (2 M, 2 M), the joint covariance of all these pixels.
+class PredictedMeasurements(NamedTuple):
+    """Where every light is expected: `uv` (M, 2) px and `S` (2 M, 2 M) px^2, the joint covariance of all these pixels.
 
     `shown` (M,) is 0 out of the lens's sight, 1 where a light may be seen, 2 where it should be.
     """
 
-    expected: Array
+    uv: Array
     S: Array
     shown: Array
 
 
 @entry
-def predict(R: Array, t: Array, twist: Array, P: Array, dt: float, q_lin: float, q_ang: float) -> None:
-    """Move pose and covariance on by `dt` s, in place; `q` are the variances that each second adds to the twist."""
+def predict(state: FilterState, dt: float, q_lin: float, q_ang: float) -> None:
+    """Move pose and covariance on by `dt` s at constant twist, in place.
+
+    `q_lin` (m/s)^2/s and `q_ang` (rad/s)^2/s are the variances that each second adds to the twist.
+    """
+    R, t, x, P = state
     n = len(P)
     back = np.eye(3)
-    rotate_exp(back, -dt * twist[3], -dt * twist[4], -dt * twist[5])
+    vx, vy, vz, wx, wy, wz = x[TWIST], x[TWIST + 1], x[TWIST + 2], x[TWIST + 3], x[TWIST + 4], x[TWIST + 5]
+    rotate_exp(back, -dt * wx, -dt * wy, -dt * wz)
     moved, turned = np.empty(3), np.empty((3, 3))
     half = 0.5 * dt * dt
-    wx, wy, wz = twist[3], twist[4], twist[5]
-    moved[0] = -dt * twist[0] + half * (wy * twist[2] - wz * twist[1])
-    moved[1] = -dt * twist[1] + half * (wz * twist[0] - wx * twist[2])
-    moved[2] = -dt * twist[2] + half * (wx * twist[1] - wy * twist[0])
+    moved[0] = -dt * vx + half * (wy * vz - wz * vy)
+    moved[1] = -dt * vy + half * (wz * vx - wx * vz)
+    moved[2] = -dt * vz + half * (wx * vy - wy * vx)
     for i in range(3):
         for k in range(3):
             moved[i] += back[i, k] * t[k]
@@ -103,11 +118,12 @@ def _adjoint(R: Array, t: Array) -> Array:
 
 
 @entry
-def attitude_update(R: Array, t: Array, x: Array, P: Array, Rp: Array, var: Array, bias: bool) -> None:
-    """Take in an attitude prior or measurement of variance `var` (3,) rad^2, in place; `x` (n,) the other states.
+def attitude_update(state: FilterState, Rp: Array, var: Array, bias: bool) -> None:
+    """Update by an attitude prior or measurement `Rp` (3, 3) = R_dock_cam of variance `var` (3,) rad^2, in place.
 
     With `bias` it is a sensor's, off by its bias and by as much again of noise, so that it never averages away.
     """
+    R, t, x, P = state
     n = len(P)
     e, J, dx, g = np.empty(3), np.empty((3, 3)), np.zeros(n), np.empty(n)
     attitude_error(R, Rp, e, J)
@@ -166,12 +182,12 @@ def difference(R0: Array, t0: Array, R: Array, t: Array, dx: Array) -> None:
 
 
 @part
-def row(lens: Array, state: State, p: Array, c: int, at: Array, h: Array, cal: Array) -> bool:
+def row(lights: Lights, state: FilterState, c: int, at: Array, h: Array, cal: Array) -> bool:
     """Pixel and Jacobians of light `c`, False if unseen: `h` (14,) as in `light_row`, `cal` (2,) with du/df, dv/df.
 
     `at` (3,) is work space.
     """
-    x = state.x
+    x, lens, p = state.x, lights.lens, lights.p
     for k in range(3):
         at[k] = p[c, k] + x[LIGHTS + 3 * c + k]
     if not light_row(lens, state.R, state.t, at, h):
@@ -218,13 +234,14 @@ def dot_row(g: Array, h: Array, cal: Array, axis: int, c: int) -> float:
 
 
 @entry
-def look(lens: Array, state: State, p: Array, axis: Array, out: Foreseen) -> None:
-    """Fill `out` with where every light at `p` (M, 3), shining along `axis` (M, 3), is expected."""
+def predict_measurements(lights: Lights, state: FilterState, out: PredictedMeasurements) -> None:
+    """Fill `out` with where every light is expected."""
+    lens, p, axis = lights
     expected, S, shown = out
     m, n = len(p), len(state.P)
     at, rows, cals, gu, gv = np.empty(3), np.empty((m, 14)), np.empty((m, 2)), np.empty(n), np.empty(n)
     for c in range(m):
-        shown[c] = 1.0 if row(lens, state, p, c, at, rows[c], cals[c]) else 0.0
+        shown[c] = 1.0 if row(lights, state, c, at, rows[c], cals[c]) else 0.0
     for c in range(m):
         if shown[c] == 0.0:
             continue
@@ -240,37 +257,27 @@ def look(lens: Array, state: State, p: Array, axis: Array, out: Foreseen) -> Non
             for a in range(2):
                 for b in range(2):
                     S[2 * k + b, 2 * c + a] = S[2 * c + a, 2 * k + b]
-        margin = _MARGIN_PX + 2.0 * math.sqrt(max(S[2 * c, 2 * c], S[2 * c + 1, 2 * c + 1]))
-        if _shines(state, p, axis, c) and inside(lens, rows[c, 0], rows[c, 1], margin):
+        margin = EDGE_PX + _SURE_SIGMAS * math.sqrt(max(S[2 * c, 2 * c], S[2 * c + 1, 2 * c + 1]))
+        for k in range(3):
+            at[k] = p[c, k] + state.x[LIGHTS + 3 * c + k]
+        if faces(state.R, state.t, at, axis[c]) and inside(lens, rows[c, 0], rows[c, 1], margin):
             shown[c] = 2.0
     for c in range(m):  # far outside the picture there is nothing to look for
         if shown[c] == 1.0:
-            margin = _MARGIN_PX + 5.0 * math.sqrt(max(S[2 * c, 2 * c], S[2 * c + 1, 2 * c + 1]))
+            margin = EDGE_PX + _POSSIBLE_SIGMAS * math.sqrt(max(S[2 * c, 2 * c], S[2 * c + 1, 2 * c + 1]))
             if not inside(lens, expected[c, 0], expected[c, 1], -margin):
                 shown[c] = 0.0
 
 
 @entry
-def windows(foreseen: Foreseen, margin_px: float, most_px: float, out: Array) -> int:
-    """Write u, v and reach px, four sigmas and a margin, of each light in sight to `out` (M, 3); how many there are."""
-    expected, S, shown = foreseen
+def windows(predicted: PredictedMeasurements, margin_px: float, most_px: float, out: Array) -> int:
+    """Write u, v and reach px, four sigmas and a margin, of each light that may be seen to `out` (M, 3); how many."""
+    expected, S, shown = predicted
     count = 0
     for c in range(len(shown)):
         u, v, a, b = expected[c, 0], expected[c, 1], S[2 * c, 2 * c], S[2 * c + 1, 2 * c + 1]
         if shown[c] > 0.0 and math.isfinite(u) and math.isfinite(v) and not (math.isnan(a) or math.isnan(b)):
-            reach = 4.0 * math.sqrt(max(a, b, 0.0)) + margin_px
+            reach = _WINDOW_SIGMAS * math.sqrt(max(a, b, 0.0)) + margin_px
             out[count, 0], out[count, 1], out[count, 2] = u, v, min(reach, most_px)
             count += 1
     return count
-
-
-@part
-def _shines(state: State, p: Array, axis: Array, c: int) -> bool:
-    """Whether light `c` sends its light toward the camera."""
-    R, t, x = state.R, state.t, state.x
-    norm, along = 0.0, 0.0
-    for k in range(3):
-        away = -(R[0, k] * t[0] + R[1, k] * t[1] + R[2, k] * t[2]) - p[c, k] - x[LIGHTS + 3 * c + k]
-        norm += away * away
-        along += away * axis[c, k]
-    return along > _SHINES * math.sqrt(norm)

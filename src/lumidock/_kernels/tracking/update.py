@@ -1,4 +1,4 @@
-"""The filter's update: all named pixels of a frame at once, and what leaving each light out would do."""
+"""The filter's update: all assigned detections of a frame at once, and what leaving each light out would do."""
 
 from __future__ import annotations
 
@@ -9,26 +9,42 @@ import numpy as np
 
 from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.lens import copy_to, factor
-from lumidock._kernels.matching.evidence import named_lights
+from lumidock._kernels.matching.evidence import assigned_lights
 from lumidock._kernels.pose import set_pose
 from lumidock._kernels.tracking.levels import outputs
 from lumidock._kernels.tracking.slant import flatten
-from lumidock._kernels.tracking.track import State, apply, difference, dot_row, gains, row
+from lumidock._kernels.tracking.track import FilterState, Lights, apply, difference, dot_row, gains, row
 from lumidock.datatypes import Array, Indices
 
 _SETTLED = 0.5  # sigmas; a pose that still moves by more in the last step is none
 
 
-class Pixels(NamedTuple):
-    """Detections `uv` (N, 2) px with covariance `cov` (N, 2, 2) px^2, and `name` (M,), that of each light or -1."""
+class Assigned(NamedTuple):
+    """Detections `uv` (N, 2) px of covariance `cov` (N, 2, 2) px^2, and `assignment` (M,): that of each light or -1."""
 
-    name: Indices
+    assignment: Indices
     uv: Array
     cov: Array
 
 
+class UpdateRules(NamedTuple):
+    """How an update goes about it.
+
+    The first `estimated` states move; the others are considered: they keep their covariance and lend it to the rest
+    (S. F. Schmidt, 1966). It is relinearised up to `steps` times. `tracking`: the prediction holds the pose, instead of
+    a first guess. Where all assigned lights lie on one `plane` (6,) (a point and the normal; NaN: they do not), the
+    covariance is that of the flattest view within three sigmas of tilt by `turn_cov` (3, 3) rad^2.
+    """
+
+    estimated: int
+    steps: int
+    tracking: bool
+    plane: Array
+    turn_cov: Array
+
+
 class _Rows(NamedTuple):
-    """Of m named `lights` (m,): pixel and Jacobian `h` (m, 14) and `cal` (m, 2) of each, as in `row`.
+    """Of m assigned `lights` (m,): pixel and Jacobian `h` (m, 14) and `cal` (m, 2) of each, as in `row`.
 
     `Z` (2 m, 2 m) is the factor L of their innovation's covariance, and `G` (2 m, n) is L^-1 H P.
     """
@@ -41,47 +57,35 @@ class _Rows(NamedTuple):
 
 
 @entry
-def take_in(
-    lens: Array,
-    p: Array,
-    R0: Array,
-    t0: Array,
-    state: State,
-    pixels: Pixels,
-    estimated: int,
-    steps: int,
-    plane: Array,
-    turn_cov: Array,
-    tracking: bool,
-    apart: Array,
+def update(
+    station: Lights, R0: Array, t0: Array, state: FilterState, seen: Assigned, rules: UpdateRules, separations: Array
 ) -> float:
-    """Take in the named pixels, all in one, relinearised up to `steps` times; in place. Returns the NIS.
+    """Update `state` by all assigned detections at once, in place; the NIS, NaN on failure.
 
-    `R0`, `t0` are the mean that `P` belongs to, those of `state` where to linearise first. Where the lights are one
-    `plane` (6,) (a point and the normal; NaN: none), the covariance is that of the flattest view within three sigmas of
-    tilt by `turn_cov` (3, 3): seen at a slant by mistake, a plane would seem to tell its tilt. When `tracking` the gain
-    is that of the flattest view as well, so that history rests on perspective and not on the choice between two slants.
+    `R0`, `t0` are the predicted pose that `P` belongs to, those of `state` where to linearise first. Seen at a slant by
+    mistake, a plane would seem to tell its tilt: so of a single plane the covariance is that of the flattest view; when
+    `tracking` the gain is too, so that history rests on perspective and not on the choice between two slants.
 
-    Only the first `estimated` states move; the others are considered: they keep their covariance and lend it to the
-    rest (S. F. Schmidt, 1966). `apart` (M, 18) is, for each named light, how far the nine `outputs` would move without
-    it, and the variance that leaving it out adds to each. NIS is NaN on failure.
+    `separations` (M, 18): for each assigned light, how far the nine `outputs` would move without it, and the variance
+    that leaving it out adds to each.
     """
     R, t, x, P = state
-    lights, n, slanted = named_lights(pixels.name), len(P), not math.isnan(plane[0])
+    plane, turn_cov, tracking, estimated = rules.plane, rules.turn_cov, rules.tracking, rules.estimated
+    lights, n, slanted = assigned_lights(seen.assignment), len(P), not math.isnan(plane[0])
     m = 2 * len(lights)
     rows = _Rows(lights, np.empty((len(lights), 14)), np.empty((len(lights), 2)), np.empty((m, m)), np.empty((m, n)))
     nu, w, dx, before, x0 = np.empty(m), np.empty(m), np.zeros(n), np.zeros(6), x.copy()
-    flat, change = State(R.copy(), t.copy(), x, P), 0.0
+    flat, change = FilterState(R.copy(), t.copy(), x, P), 0.0
     difference(R0, t0, R, t, dx)
-    for step in range(steps):
+    for step in range(rules.steps):
         set_pose(flat.R, flat.t, R, t)
         if slanted and tracking:
             flatten(R, t, plane, turn_cov, flat.R, flat.t)
-        if not _whiten(lens, p, flat, pixels, rows):
+        if not _whiten(station, flat, seen, rows):
             return np.nan
-        if slanted and tracking and not _see(lens, p, state, rows):
+        if slanted and tracking and not _reproject(station, state, rows):
             return np.nan
-        _innovate(pixels, dx, rows, nu)
+        _innovate(seen, dx, rows, nu)
         _forward(rows.Z, nu, w)
         for j in range(n):
             dx[j] = 0.0
@@ -107,25 +111,25 @@ def take_in(
     if slanted:
         set_pose(flat.R, flat.t, R, t)
         flatten(R, t, plane, turn_cov, flat.R, flat.t)
-        if not _whiten(lens, p, flat, pixels, rows):
+        if not _whiten(station, flat, seen, rows):
             return np.nan
         _forward(rows.Z, nu, w)
     _shrink(P, rows.G, estimated)
-    _separate(rows, w, outputs(R, t), apart)
+    _separate(rows, w, outputs(R, t), separations)
     return square
 
 
 @part
-def _whiten(lens: Array, p: Array, state: State, pixels: Pixels, rows: _Rows) -> bool:
+def _whiten(station: Lights, state: FilterState, seen: Assigned, rows: _Rows) -> bool:
     """Fill all of `rows` but its lights at a state; False where a light is out of the lens's sight."""
     lights, h, cal, Z, G = rows
     m, n, at = len(lights), len(state.P), np.empty(3)
     for k in range(m):
-        if not row(lens, state, p, lights[k], at, h[k], cal[k]):
+        if not row(station, state, lights[k], at, h[k], cal[k]):
             return False
         gains(state.P, h[k], cal[k], lights[k], G[2 * k], G[2 * k + 1])
     for k in range(m):
-        c, cov = lights[k], pixels.cov[pixels.name[lights[k]]]
+        c, cov = lights[k], seen.cov[seen.assignment[lights[k]]]
         for r in range(2 * k, 2 * m):
             Z[r, 2 * k] = dot_row(G[r], h[k], cal[k], 0, c)
             Z[r, 2 * k + 1] = dot_row(G[r], h[k], cal[k], 1, c)
@@ -150,24 +154,24 @@ def _whiten(lens: Array, p: Array, state: State, pixels: Pixels, rows: _Rows) ->
 
 
 @part
-def _see(lens: Array, p: Array, state: State, rows: _Rows) -> bool:
-    """Put the pixels of another state into `rows`, whose Jacobians stay; False where a light is out of sight."""
+def _reproject(station: Lights, state: FilterState, rows: _Rows) -> bool:
+    """Put the pixels of another state into `rows`, whose Jacobians stay; False where the lens does not see a light."""
     at, h, cal = np.empty(3), np.empty(14), np.empty(2)
     for k in range(len(rows.lights)):
-        if not row(lens, state, p, rows.lights[k], at, h, cal):
+        if not row(station, state, rows.lights[k], at, h, cal):
             return False
         rows.h[k, 0], rows.h[k, 1] = h[0], h[1]
     return True
 
 
 @part
-def _innovate(pixels: Pixels, dx: Array, rows: _Rows, nu: Array) -> None:
+def _innovate(seen: Assigned, dx: Array, rows: _Rows, nu: Array) -> None:
     """Innovation `nu` (2 m,) against the prediction, from which the state is `dx` (n,) away."""
     for k in range(len(rows.lights)):
         c, h, cal = rows.lights[k], rows.h[k], rows.cal[k]
-        i = pixels.name[c]
-        nu[2 * k] = pixels.uv[i, 0] - h[0] + dot_row(dx, h, cal, 0, c)
-        nu[2 * k + 1] = pixels.uv[i, 1] - h[1] + dot_row(dx, h, cal, 1, c)
+        i = seen.assignment[c]
+        nu[2 * k] = seen.uv[i, 0] - h[0] + dot_row(dx, h, cal, 0, c)
+        nu[2 * k + 1] = seen.uv[i, 1] - h[1] + dot_row(dx, h, cal, 1, c)
 
 
 @part
@@ -194,7 +198,7 @@ def _shrink(P: Array, G: Array, estimated: int) -> None:
 
 
 @part
-def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
+def _separate(rows: _Rows, w: Array, C: Array, separations: Array) -> None:
     """One-fault solution separation: what leaving each light out of the update would do to the outputs `C`.
 
     With S = L L^T the innovation's covariance (`Z`), `G` = L^-1 H P, `w` = L^-1 nu and V the columns of L^-1 that
@@ -203,9 +207,9 @@ def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
     """
     lights, Z, G, m = rows.lights, rows.Z, rows.G, len(rows.lights)
     V, U, Y = np.empty((2 * m, 2)), np.empty((9, 2)), np.empty((2, 6))
-    for c in range(len(apart)):
+    for c in range(len(separations)):
         for j in range(18):
-            apart[c, j] = 0.0
+            separations[c, j] = 0.0
     for k in range(m):
         a = b = d = wu = wv = 0.0
         for o in range(6):
@@ -233,5 +237,5 @@ def _separate(rows: _Rows, w: Array, C: Array, apart: Array) -> None:
         c = lights[k]
         for j in range(9):
             u, v = (d * U[j, 0] - b * U[j, 1]) / det, (a * U[j, 1] - b * U[j, 0]) / det
-            apart[c, j] = -(u * wu + v * wv)
-            apart[c, 9 + j] = u * U[j, 0] + v * U[j, 1]
+            separations[c, j] = -(u * wu + v * wv)
+            separations[c, 9 + j] = u * U[j, 0] + v * U[j, 1]
