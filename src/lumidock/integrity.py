@@ -23,6 +23,7 @@ _FAR_SHARE, _FAR_DEG = 0.10, 10.0  # beyond: a share of z, and degrees
 _GUIDE_BEARING_RAD, _GUIDE_RANGE_M, _GUIDE_RANGE_SHARE = math.radians(1.5), 0.3, 0.10  # the contract's
 _ANY_BEARING_RAD = math.sqrt(2.0) * math.pi  # at the origin itself a bearing says nothing ...
 _CLEAR, _STEEP_RAD = 2.0, 0.3  # ... which begins so many range levels away, or with such a bearing level
+_IDENTITY = np.eye(4)  # copied: half as long as another
 GUIDE_FROM_M = 3.0  # nearer to the dock's origin, or past it, bearing and range say nothing and the pose decides
 
 
@@ -76,7 +77,7 @@ def bounds(tracks: Sequence[Track], config: IntegrityConfig) -> Bounds:
             apart = _apart(first, other)
             wider = apart + np.array(_levels(other, config, np.empty((9, 9))))
             pl = tuple(np.maximum(pl, wider).tolist())
-    T_dock_cam, R_dock_cam, t = np.eye(4), first.state.R.T, first.state.t
+    T_dock_cam, R_dock_cam, t = _IDENTITY.copy(), first.state.R.T, first.state.t
     T_dock_cam[:3, :3], T_dock_cam[:3, 3] = R_dock_cam, -(R_dock_cam @ t)
     x, y, z = t.tolist()
     reach = math.sqrt(x * x + y * y + z * z)
@@ -173,7 +174,8 @@ def assess(
     bound = bounds(state.hypotheses, config)
     proven = is_proven(first, state.margin, config)
     valid, used = proven and pose_holds(bound), first.last.n_used
-    state = replace(state, stage=stage(first, context.model) or state.stage)
+    now = stage(first, context.model) or state.stage
+    state = state if now == state.stage else replace(state, stage=now)
     fix = Fix(
         detections.frame,
         detections.t_ns,

@@ -33,14 +33,14 @@ def label(frame: Frame, detections: Detections, config: LabelConfig, saturated: 
         picture(frame),
         _order(frame.encoding),
         _LINEAR if mosaic or frame.image.dtype != np.uint8 else _linear(config.gamma),
-        saturated,
-        detections.uv,
-        detections.radius_px,
-        config.ring,
-        config.clear_px,
-        config.min_reach_px,
-        decide,
-        p_rear,
+        clipped=saturated,
+        uv=detections.uv,
+        radius=detections.radius_px,
+        ring=config.ring,
+        clear_px=config.clear_px,
+        least_reach_px=config.min_reach_px,
+        decide=decide,
+        p_rear=p_rear,
     )
     return replace(detections, p_rear=p_rear)
 

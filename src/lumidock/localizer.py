@@ -78,7 +78,7 @@ def step(
     if refused == "bad_stamp":
         return integrity.no_fix(state, detections, "none", refused), replace(state, last=detections)
     predicted = predicted.with_attitude(detections.attitude)
-    state = _arrived(replace(state, last=detections), predicted, context)
+    state = _arrived(state, detections, predicted, context)
     if refused:
         return integrity.no_fix(state, detections, "coasting" if state.confirmed else "none", refused), state
     frame = measurements(detections, context.model, context.config.match)
@@ -102,15 +102,15 @@ def _why_refused(last: Detections | None, detections: Detections) -> str:
     return "too_many" if len(detections) > MAX_DETECTIONS else ""
 
 
-def _arrived(state: LocalizerState, predicted: Prediction, context: Context) -> LocalizerState:
+def _arrived(state: LocalizerState, detections: Detections, predicted: Prediction, context: Context) -> LocalizerState:
     """The state at the time of a frame. Of a track that is lost only what it learned of the calibration stays."""
     if predicted.tracks:
         margin = verify.remaining_margin(predicted.tracks[0], state.margin, context.config.integrity)
-        return replace(state, hypotheses=predicted.tracks, margin=margin)
+        return replace(state, last=detections, hypotheses=predicted.tracks, margin=margin)
     calibration = state.calibration
     if state.confirmed and state.first.estimates_calibration:
         calibration = learned_calibration(state.first)
-    return replace(state, hypotheses=(), confirmed=False, calibration=calibration)
+    return replace(state, last=detections, hypotheses=(), confirmed=False, calibration=calibration)
 
 
 def _tracked(

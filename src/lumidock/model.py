@@ -166,7 +166,8 @@ def measurements(detections: Detections, model: StationModel, config: MatchConfi
     whole = lens[6] * lens[7]
     box = min(span + config.clutter_margin_px**2, whole) if n else whole
     density = (1.0 - share) / whole + share / box
-    return frame._replace(log_density=math.log(density * config.spurious / (1.0 + config.spurious)))
+    log_density = math.log(density * config.spurious / (1.0 + config.spurious))
+    return Measurements(uv, cov, frame.var, frame.like, p_light, log_density)
 
 
 def count_lamps(frame: Measurements) -> int:

@@ -79,7 +79,7 @@ class PoseSolution:
 def solve_pose(
     station: Station, camera: Camera, lights: Indices, uv: Array, cov_px2: Array | None = None, noise_px: float = 0.5
 ) -> tuple[PoseSolution, ...]:
-    """The poses that one frame's named lights allow, the likeliest first: two where the flip of a plane leaves two.
+    """The poses that one frame's identified lights allow, likeliest first: two where the flip of a plane leaves two.
 
     `lights` (N,) indices into the station, their pixels `uv` (N, 2) and covariance `cov_px2` (N, 2, 2), else
     `noise_px`. SQPnP, then Gauss-Newton under the covariance of all errors together: pixels, survey (each light, each

@@ -168,13 +168,13 @@ def start(
     never = LastSeen(t_ns, _NEVER, (_NEVER,) * model.n_layers)
     fresh = Track(t_ns, t_ns, state, never, FrameResult.nothing(model), log_weight=hypothesis.log_evidence)
     first = _Start(hypothesis.R, hypothesis.t, None)
-    begun = _update(fresh, hypothesis.assignment, frame, model, config, first)
+    begun = _update(fresh, hypothesis.assignment, frame, model, config, guess=first)
     for _ in range(_MAX_FLATTENINGS):
         if begun is None or math.isnan(begun.last.plane[0]):
             break
         turn_cov = begun.state.P[3:6, 3:6].copy()
         flatter = _Start(begun.state.R, begun.state.t, turn_cov)
-        begun = _update(fresh, hypothesis.assignment, frame, model, config, flatter)
+        begun = _update(fresh, hypothesis.assignment, frame, model, config, guess=flatter)
         if begun is not None and np.trace(begun.state.P[3:6, 3:6]) < _FLATTENED * np.trace(turn_cov):
             break
     return begun
@@ -186,7 +186,17 @@ def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
     state = FilterState(R.copy(), t.copy(), x, P.copy())
     kernel.predict(state, (t_ns - track.t_ns) * 1e-9, config.accel_m_s2**2, config.accel_rad_s2**2)
     lately = t_ns - track.seen.agreed_ns <= config.max_gap_s * 1e9
-    return replace(track, t_ns=t_ns, state=state, agreeing_frames=track.agreeing_frames if lately else 0)
+    return Track(
+        t_ns=t_ns,
+        began_ns=track.began_ns,
+        state=state,
+        seen=track.seen,
+        last=track.last,
+        estimates_calibration=track.estimates_calibration,
+        log_weight=track.log_weight,
+        agreeing_frames=track.agreeing_frames if lately else 0,
+        mean_deviate=track.mean_deviate,
+    )
 
 
 def update_attitude(track: Track, attitude: Attitude) -> Track:
@@ -285,8 +295,7 @@ def update(
 
     From the first frame on that shows `joint_lights` lights of two layers, calibration and light positions move too.
     """
-    updated = _update(track, assignment, frame, model, config, None)
-    return None if updated is None else replace(updated, log_weight=track.log_weight + log_evidence)
+    return _update(track, assignment, frame, model, config, log_evidence=log_evidence)
 
 
 def _update(
@@ -295,7 +304,9 @@ def _update(
     frame: Measurements,
     model: StationModel,
     config: TrackConfig,
-    guess: _Start | None,
+    *,
+    guess: _Start | None = None,
+    log_evidence: float = 0.0,
 ) -> Track | None:
     """The filter's update, linearised first at a `guess`, or at the prediction where there is none."""
     count = model.count(assignment)
@@ -314,28 +325,37 @@ def _update(
         turn_cov=turn_cov,
     )
     separations, seen = np.zeros((len(model), 18)), Assigned(assignment, frame.uv, frame.cov)
-    nis = update_kernel.update(model.lights, R0, t0, state, seen, rules, separations)
+    nis = update_kernel.update(model.lights, track.state, state, seen, rules, separations)
     if not math.isfinite(nis):
         return None
     # a pose of which nothing was known takes up six of the pixels' degrees of freedom
     deviate = _deviate(nis, 2 * sum(count) - (6 if guess else 0))
     result = FrameResult(assignment, count, separations, plane, nis, deviate)
-    return _after(replace(track, state=state, estimates_calibration=both, last=result), config)
-
-
-def _after(track: Track, config: TrackConfig) -> Track:
-    """The track with its times, its frames that agree and its mean deviate brought up to its last frame."""
-    t_ns, last, seen = track.t_ns, track.last, track.seen
-    agrees = last.n_used >= CHECKED_LIGHTS
-    before = zip(last.count, seen.layer_ns, strict=True)
-    layer_ns = tuple(t_ns if c >= LAYER_LIGHTS or (c > 0 and was > _NEVER) else was for c, was in before)
-    memory = config.strain_memory
-    return replace(
-        track,
-        seen=LastSeen(t_ns, t_ns if agrees else seen.agreed_ns, layer_ns),
-        agreeing_frames=track.agreeing_frames + int(agrees or seen.agreed_ns == t_ns),
-        mean_deviate=memory * track.mean_deviate + math.sqrt(1.0 - memory**2) * last.deviate,
+    seen_now = _seen(track, count)
+    return Track(
+        t_ns=track.t_ns,
+        began_ns=track.began_ns,
+        state=state,
+        seen=seen_now,
+        last=result,
+        estimates_calibration=both,
+        log_weight=track.log_weight + log_evidence,
+        agreeing_frames=track.agreeing_frames + int(seen_now.agreed_ns == track.t_ns),
+        mean_deviate=_mean(track.mean_deviate, deviate, config.strain_memory),
     )
+
+
+def _seen(track: Track, count: tuple[int, ...]) -> LastSeen:
+    """When lights were seen last, after a frame that shows so many of each layer: a layer enters with three or more."""
+    t_ns, seen = track.t_ns, track.seen
+    before = zip(count, seen.layer_ns, strict=True)
+    layer_ns = tuple(t_ns if c >= LAYER_LIGHTS or (c > 0 and was > _NEVER) else was for c, was in before)
+    return LastSeen(t_ns, t_ns if sum(count) >= CHECKED_LIGHTS else seen.agreed_ns, layer_ns)
+
+
+def _mean(before: float, deviate: float, memory: float) -> float:
+    """The exponential mean of normal deviates, scaled so that its variance is one as well."""
+    return memory * before + math.sqrt(1.0 - memory**2) * deviate
 
 
 def _deviate(square: float, dof: int) -> float:

@@ -1,4 +1,4 @@
-"""Gauss-Newton for one pose from named pixels and an attitude prior.
+"""Gauss-Newton for one pose from assigned detections and an attitude prior.
 
 The pose is `R`, `t` of T_cam_dock, perturbed on the right: xi = [m, rad] in `dock` axes. A prior is `Rp` = R_dock_cam
 expected, and `info` (3,) 1/rad^2 on the tilt toward cam x, toward cam y, and on the roll about the optical axis.

@@ -116,4 +116,4 @@ class Bound:
             turn_cov=np.eye(3),
         )
         separations = np.zeros((len(assignment), 18))
-        update(self._model.lights, R, t, state, Assigned(assignment, uv, cov), rules, separations)
+        update(self._model.lights, self._at(R, t), state, Assigned(assignment, uv, cov), rules, separations)

@@ -68,13 +68,11 @@ def associate(
             found = _keep(assignment, cost[d] + always, ranking, found)
             d -= 1
             continue
-        c = order[d]
+        c, k = order[d], at[d]
         if assignment[c] >= 0:
             taken[assignment[c]] = -1
             assignment[c] = -1
-        k = at[d]
-        at[d] += 1
-        nodes += 1
+        at[d], nodes = k + 1, nodes + 1
         if nodes > max_nodes:
             return -1
         if k > n_cand[c]:

@@ -20,9 +20,11 @@ from lumidock._kernels.visibility import EDGE_PX, faces
 from lumidock.datatypes import Array
 
 TWIST, BIAS, CALIBRATION, LIGHTS = 6, 12, 15, 18
-_SURE_SIGMAS, _POSSIBLE_SIGMAS = 2.0, 5.0  # of its pixel: inside the picture by so many a light should be seen; outside
-# it by more it cannot
-_WINDOW_SIGMAS = 4.0  # reach of a search window: one in 30,000 lights lies outside in one axis
+_SURE_SIGMAS, _POSSIBLE_SIGMAS = (
+    2.0,
+    5.0,
+)  # of a pixel: this far inside a light should be seen; this far outside it cannot
+_WINDOW_SIGMAS = 4.0  # reach of a search window: one light in 16,000 lies outside in one axis
 
 
 class Lights(NamedTuple):

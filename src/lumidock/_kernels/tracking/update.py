@@ -58,18 +58,18 @@ class _Rows(NamedTuple):
 
 @entry
 def update(
-    station: Lights, R0: Array, t0: Array, state: FilterState, seen: Assigned, rules: UpdateRules, separations: Array
+    station: Lights, predicted: FilterState, state: FilterState, seen: Assigned, rules: UpdateRules, separations: Array
 ) -> float:
     """Update `state` by all assigned detections at once, in place; the NIS, NaN on failure.
 
-    `R0`, `t0` are the predicted pose that `P` belongs to, those of `state` where to linearise first. Seen at a slant by
+    The pose of `predicted` is the one that `P` belongs to, that of `state` where to linearise first. Seen at a slant by
     mistake, a plane would seem to tell its tilt: so of a single plane the covariance is that of the flattest view; when
     `tracking` the gain is too, so that history rests on perspective and not on the choice between two slants.
 
     `separations` (M, 18): for each assigned light, how far the nine `outputs` would move without it, and the variance
     that leaving it out adds to each.
     """
-    R, t, x, P = state
+    R0, t0, (R, t, x, P) = predicted.R, predicted.t, state
     plane, turn_cov, tracking, estimated = rules.plane, rules.turn_cov, rules.tracking, rules.estimated
     lights, n, slanted = assigned_lights(seen.assignment), len(P), not math.isnan(plane[0])
     m = 2 * len(lights)
