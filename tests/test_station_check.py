@@ -98,9 +98,9 @@ def test_doctor_says_what_is_in_the_way(monkeypatch, tmp_path):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         assert doctor._port("page", taken.getsockname()[1]).mark == "note"
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("lumidock._kernels.compiling.FOLDER", tmp_path)
     assert doctor._caches().mark == "note"
-    monkeypatch.setattr("os.access", lambda *_: False)
+    monkeypatch.setattr("lumidock._kernels.compiling.FOLDER", None)
     assert doctor._caches().mark == "bad"
     monkeypatch.setattr("time.time", lambda: 5.0)
     assert doctor._clock().mark == "bad"

@@ -12,10 +12,10 @@ from lumidock.localizer import Localizer
 from lumidock.paper import PaperLocalizer
 
 COUNT = """
-import gc, sys
+import sys
 from pathlib import Path
 import numpy as np
-from numba.core.dispatcher import Dispatcher
+from lumidock._kernels.compiling import ENTRIES
 from lumidock.camera import load_camera
 from lumidock.datatypes import Frame
 from lumidock.localizer import Localizer
@@ -24,8 +24,7 @@ from lumidock.streams.sources import open_source
 from lumidock.app.warm import warm_up
 
 def compiled():
-    kernels = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]
-    return {(one.py_func.__module__, one.py_func.__name__, str(known)) for one in kernels for known in one.signatures}
+    return {(one.__module__, one.__name__, str(known)) for one in ENTRIES for known in one.signatures}
 
 source = open_source(Path(sys.argv[1]))
 dock, lens = load_station(source.station), load_camera(source.camera)

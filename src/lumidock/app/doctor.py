@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import platform
 import socket
 import sys
@@ -69,17 +68,11 @@ def _python() -> Finding:
 
 
 def _caches() -> Finding:
-    """Compiled code lies beside the source, or where NUMBA_CACHE_DIR says."""
-    import lumidock._kernels as kernels
+    """The compiled kernels of the default method."""
+    from lumidock.app.warm import compiled_code
 
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR", "") or Path(kernels.__file__ or ".").parent)
-    count = sum(1 for _ in folder.rglob("*.nbi"))
-    if count:
-        return Finding("ok", "caches", f"{count} compiled functions in {folder}")
-    if not os.access(folder, os.W_OK):
-        text = f"{folder} cannot be written, so every start compiles anew; set NUMBA_CACHE_DIR to a folder that can"
-        return Finding("bad", "caches", text)
-    return Finding("note", "caches", "cold: the first frame takes some seconds; `lumidock demo` fills them")
+    state = compiled_code()
+    return Finding(state.mark, "caches", state.text)
 
 
 def _extra(name: str, modules: tuple[str, ...]) -> Finding:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import gc
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from multiprocessing import get_context
+from typing import Literal
 
 import numpy as np
 
 from lumidock import detect, layers
+from lumidock._kernels import compiling
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Fix, Frame
@@ -22,10 +25,33 @@ _BLANK = 5  # the frame without lights, after which the track has to be taken up
 _FORMATS = {"8 bits": ("bgr8", 255), "16 bits": ("bayer_rggb16", 65535)}
 _OBJECTS = 50_000  # made between two searches for garbage, of which compiling leaves little
 _AWAY = 3.0  # and _STEP in widths of the array, all of whose lights are in the picture then
+_OTHERS = ("swarm", "pose")  # kernel modules whose entries only the paper's method and the calibration call
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledCode:
+    """Whether the next run finds its kernels compiled: ok, not yet, or never; and a sentence that says so."""
+
+    mark: Literal["ok", "note", "bad"]
+    text: str
+
+
+def compiled_code() -> CompiledCode:
+    """Look at what is compiled on disk for the sources and the numba at hand."""
+    done, needed = compiling.compiled_entries(_OTHERS)
+    if compiling.DISABLED:
+        return CompiledCode("bad", "NUMBA_DISABLE_JIT is set: nothing is compiled, which is too slow for pictures")
+    if compiling.FOLDER is None:
+        text = "no folder for compiled code can be written, so every run compiles for one to two minutes before its"
+        return CompiledCode("bad", f"{text} first fix; set NUMBA_CACHE_DIR to a folder that can be written")
+    if done < needed:
+        text = f"{done} of {needed} kernels are compiled in {compiling.FOLDER}; the next run compiles the rest,"
+        return CompiledCode("note", f"{text} up to two minutes, unless `lumidock warm` has done so")
+    return CompiledCode("ok", f"all {needed} kernels are compiled in {compiling.FOLDER}; no run waits for them")
 
 
 def compile_ahead(station: Station, camera: Camera) -> None:
-    """Compile detection and matching into numba's cache, at the same time in two processes.
+    """Compile detection and matching for the runs to come, at the same time in two processes.
 
     What one of them could not, `warm_up` does.
     """
@@ -63,7 +89,7 @@ def _matching(station: Station, camera: Camera) -> None:
 def warm_up(process: Callable[[Frame], Fix], station: Station, camera: Camera) -> Iterator[tuple[str, Fix]]:
     """Show the image door of a localizer, to be thrown away after, a drawn dock in every format of pixels.
 
-    Yields each format and its last fix. What is compiled stays in this process and in numba's cache on disk.
+    Yields each format and its last fix. What is compiled stays in this process and on disk.
     """
     for name, frames in _films(station, camera):
         yield name, [process(frame) for frame in frames][-1]

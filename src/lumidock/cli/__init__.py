@@ -47,6 +47,7 @@ from lumidock.cli.shared import (
     require_folder,
     shipped_or_path,
     simulated,
+    warn_if_nothing_is_kept,
 )
 from lumidock.config import Config, load_config
 from lumidock.datatypes import Fix
@@ -163,6 +164,7 @@ def _run(
     camera_file = out / "camera.yaml" if described else file_of("camera", camera, opened.camera, opened)
     dock = load_station(station_file)
     lens = calibration_of(camera, opened)
+    warn_if_nothing_is_kept()
     localizer = localizer_of(method, dock, lens, settings, cold=cold)
     if out.is_dir() and opened.path.is_dir() and out.samefile(opened.path):
         raise InputError(f"{out}: is the source; write the run elsewhere")
@@ -282,6 +284,7 @@ def _campaign(
         bound=bound,
     )
     prepare(campaign, out, force=force)
+    warn_if_nothing_is_kept()
     with progress_bar("campaign") as progress:
         speed = run_campaign(campaign, out, workers=workers, cluster=cluster, progress=progress)
     table = tabulate(campaign, out)
@@ -304,16 +307,19 @@ def _seeds(text: str) -> tuple[int, int]:
 @app.command("warm", epilog=example("lumidock warm"))
 def _warm() -> None:
     """Compile ahead, so that no run waits for it."""
-    from lumidock.app.warm import compile_ahead, warm_up
+    from lumidock.app.warm import compile_ahead, compiled_code, warm_up
     from lumidock.localizer import Localizer
 
     dock = load_station(shipped_or_path("station", DEFAULT_STATION))
     lens = load_camera(shipped_or_path("camera", DEFAULT_CAMERA))
-    print("compiling detection and matching, half a minute or so ...", flush=True)
+    state = compiled_code()
+    if state.mark == "bad":
+        raise LumidockError(state.text)
+    print("compiling detection and matching, one to two minutes ...", flush=True)
     compile_ahead(dock, lens)
     for name, _ in warm_up(Localizer(dock, lens).process, dock, lens):
         print(f"ready for {name}", flush=True)
-    print("kept in numba's cache")
+    print(compiled_code().text)
 
 
 @app.command("demo", epilog=example("lumidock demo --force"))
@@ -344,6 +350,7 @@ def _demo(
     )
     dock, lens = load_station(station_file), load_camera(camera_file)
     copy(station_file, sequence / "station.yaml")
+    warn_if_nothing_is_kept()
     with progress_bar("simulating") as progress:
         write_rendered(scenario, dock, lens, seed, sequence, progress=progress)
     source = open_source(sequence)

@@ -38,6 +38,7 @@ from lumidock.cli.shared import (
     prepare_folder,
     require_new,
     simulated,
+    warn_if_nothing_is_kept,
 )
 from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
@@ -127,6 +128,7 @@ def _serve(
         dock = load_station(station_file)
         lens = calibration_of(camera, opened)
         scene = Scene(dock, lens, mounting)
+        warn_if_nothing_is_kept()
         list(warm_up(localizer_of(method, dock, lens, settings).process, dock, lens))
         localizer = localizer_of(method, dock, lens, settings)
         sinks = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.resources import files
@@ -80,6 +81,15 @@ Fps = Annotated[
 ]
 Workers = Annotated[int | None, typer.Option("--workers", metavar="N", min=1, help="Processes; by default one a core.")]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from it.")]
+
+
+def warn_if_nothing_is_kept() -> None:
+    """Say in one line that this run compiles anew, or not at all, and what to do about it."""
+    from lumidock.app.warm import compiled_code
+
+    state = compiled_code()
+    if state.mark == "bad":
+        print(f"warning: {state.text}", file=sys.stderr)
 
 
 def file_of(kind: str, given: str | None, beside: Path | None, source: Source) -> Path:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from lumidock._kernels.compiling import entry, part
 from lumidock.datatypes import Array, Indices
 
 
-@njit(cache=True)
+@entry
 def assign(cost: Array) -> Indices:
     """Column of each row (N,) in the cheapest one-to-one assignment of `cost` (N, M); -1 for rows left over.
 
@@ -26,7 +26,7 @@ def assign(cost: Array) -> Indices:
     return _assign_rows(cost)
 
 
-@njit()
+@part
 def _assign_rows(cost: Array) -> Indices:
     """`assign` for N <= M. Row and column 0 of the work arrays are sentinels."""
     n, m = cost.shape
@@ -69,7 +69,7 @@ def _assign_rows(cost: Array) -> Indices:
     return column_of_row
 
 
-@njit(cache=True)
+@entry
 def registration_cost(x: Array, seen: Array, lights: Array, previous: Array, w1: float, w2: float) -> Array:
     """Cost (N, M) of giving each normalised spot `seen` (N, 2), moved by x = [theta, s, tx, ty], each light's name.
 
@@ -88,7 +88,7 @@ def registration_cost(x: Array, seen: Array, lights: Array, previous: Array, w1:
     return cost
 
 
-@njit()
+@part
 def _fitness(
     x: Array,
     seen: Array,
@@ -115,7 +115,7 @@ def _fitness(
     return total
 
 
-@njit()
+@part
 def _under_explored(best_at: Array, low: Array, high: Array, rng: np.random.Generator) -> Array:
     """The one of eight random places that lies farthest from every particle's best so far."""
     farthest, place = -1.0, low.copy()
@@ -129,7 +129,7 @@ def _under_explored(best_at: Array, low: Array, high: Array, rng: np.random.Gene
     return place
 
 
-@njit(cache=True)
+@entry
 def swarm(
     seen: Array,
     lights: Array,

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import inner, summing
-from lumidock._kernels.compiling import entry
+from lumidock._kernels.compiling import entry, fast_part, part
 from lumidock._kernels.detection import samples
 from lumidock._kernels.detection.samples import Picture
 from lumidock.datatypes import Array, Indices
@@ -56,7 +55,7 @@ def colors(
         p_rear[n] = _of_light(light[2], light[3], decide)
 
 
-@inner
+@part
 def _add_disc(
     picture: Picture,
     order: Indices,
@@ -87,7 +86,7 @@ def _add_disc(
                     light[1, order[p]] += 1.0
 
 
-@inner
+@part
 def _rim(picture: Picture, order: Indices, linear: Array, u: float, v: float, outer: float, rim: Array) -> int:
     """Write the light of each colour in the surroundings of a spot to `rim` (3, N); returns how many samples."""
     pitch, reach, count = 2 if picture.planes == 4 else 1, 2.0 * outer + 2.0, 0
@@ -101,7 +100,7 @@ def _rim(picture: Picture, order: Indices, linear: Array, u: float, v: float, ou
     return count
 
 
-@inner
+@part
 def _of_light(signal: Array, sigma: Array, decide: tuple[float, float, float, float]) -> float:
     """P(rear) from linear light (3,) of B, G, R and its error, NaN where it is too weak.
 
@@ -117,18 +116,18 @@ def _of_light(signal: Array, sigma: Array, decide: tuple[float, float, float, fl
     return min(max(1.0 / (1.0 + np.exp(-odds)), limit), 1.0 - limit)
 
 
-@inner
+@part
 def _steps(center: float, reach: float, size: int, pitch: int, step: int) -> range:
     """Rows or columns around a place, as far as they are in the picture."""
     return range(max(int(center - reach), 0) // pitch * pitch, min(int(center + reach) + 2, size - pitch + 1), step)
 
 
-@inner
+@part
 def _light(value: float, linear: Array) -> float:
     return float(linear[min(int(value + 0.5), 255)]) if len(linear) else value
 
 
-@inner
+@part
 def _is_burnt(picture: Picture, clipped: float, u: float, v: float, reach: float) -> bool:
     """Whether any sample of a disc is saturated."""
     step, channels = 1 + int(reach) // 8, 3 if picture.planes == 3 else 1
@@ -142,7 +141,7 @@ def _is_burnt(picture: Picture, clipped: float, u: float, v: float, reach: float
     return False
 
 
-@summing
+@fast_part
 def _clipped_moments(values: Array) -> tuple[float, float]:
     """Mean and standard deviation without outliers."""
     level, spread = 0.0, np.inf

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import inner, summing
+from lumidock._kernels.compiling import fast_part, part
 from lumidock._kernels.detection import fields, gauss, patch, region, samples
 from lumidock._kernels.detection.patch import CloseUp
 from lumidock._kernels.detection.samples import Picture
@@ -32,7 +32,7 @@ Center = tuple[float, float]
 Cov = tuple[float, float, float]  # uu, uv, vv
 
 
-@inner
+@part
 def describe(
     picture: Picture, close: CloseUp, u: int, v: int, share: float, shared: float, q: Array, spots: Array, n: int
 ) -> bool:
@@ -83,7 +83,7 @@ def describe(
     return not _is_known(spots, n)
 
 
-@inner
+@part
 def _balanced(close: CloseUp, variance: float, mosaic: bool, lower: float) -> tuple[Center, Cov]:
     """The balance of the region with its soft edge, over `lower`, and its covariance by noise of a `variance`."""
     where, unit = close.where, float(close.where[patch.UNIT])
@@ -94,7 +94,7 @@ def _balanced(close: CloseUp, variance: float, mosaic: bool, lower: float) -> tu
     return (u, v), (unit * unit * xx, unit * unit * xy, unit * unit * yy)
 
 
-@inner
+@part
 def _fitted(planes: int, close: CloseUp, center: Center, radius: float, q: Array) -> tuple[float, Center, Cov]:
     """Width, centre and covariance of the Gaussian that fits best, from the width that the radius gives or a wider."""
     noise = close.ground[patch.NOISE]
@@ -111,7 +111,7 @@ def _fitted(planes: int, close: CloseUp, center: Center, radius: float, q: Array
     return 0.0, center, (0.0, 0.0, 0.0)
 
 
-@inner
+@part
 def _with_skew(
     picture: Picture, close: CloseUp, center: Center, cov: Cov, higher: float, soft: float, astray: float, q: Array
 ) -> Cov:
@@ -132,7 +132,7 @@ def _with_skew(
     return cov[0] + 0.5 * skewed[0] + astray, cov[1] + 0.5 * skewed[1], cov[2] + 0.5 * skewed[2] + astray
 
 
-@inner
+@part
 def _size(close: CloseUp, level: float, shared: float, spot: Array) -> None:
     """What the region grown at `level` says of a spot: all but its exact centre and covariance."""
     sums, where, ground, unit = close.sums, close.where, close.ground, float(close.where[patch.UNIT])
@@ -149,7 +149,7 @@ def _size(close: CloseUp, level: float, shared: float, spot: Array) -> None:
     spot[fields.SATURATED], spot[fields.CUT] = sums[region.CLIPPED] / area, sums[region.EDGE] / area
 
 
-@inner
+@part
 def _floor(planes: int, weight: Array, spot: Array, cut_off: bool, q: Array) -> float:
     """Variance of a centre that has no noise."""
     variance = q[fields.FLOOR_PX] ** 2
@@ -160,13 +160,13 @@ def _floor(planes: int, weight: Array, spot: Array, cut_off: bool, q: Array) -> 
     return float(variance)
 
 
-@inner
+@part
 def _is_coarse(planes: int, weight: Array) -> bool:
     """Whether a spot shows most in a colour that has half of the samples: blue or red."""
     return bool(planes == 3 and weight[1] < max(weight[0], weight[2]))
 
 
-@inner
+@part
 def small_snr(close: CloseUp, x: float, y: float, width: float, shared: float) -> float:
     """How far a Gaussian window stands out of noise, which averages out in it, and texture, which does not."""
     ground = close.ground
@@ -174,7 +174,7 @@ def small_snr(close: CloseUp, x: float, y: float, width: float, shared: float) -
     return float(amplitude / np.sqrt(shared * ground[patch.NOISE] ** 2 / averaged + ground[patch.HIDES] ** 2))
 
 
-@inner
+@part
 def peak_value(close: CloseUp) -> float:
     """Largest sample around the start of a spot, which becomes its start."""
     where, best = close.where, -1e9
@@ -191,7 +191,7 @@ def peak_value(close: CloseUp) -> float:
     return best
 
 
-@inner
+@part
 def holds_another(close: CloseUp, spots: Array, n: int) -> bool:
     """Whether the grown region covers the centre of a spot found before."""
     where, unit = close.where, float(close.where[patch.UNIT])
@@ -204,7 +204,7 @@ def holds_another(close: CloseUp, spots: Array, n: int) -> bool:
     return False
 
 
-@inner
+@part
 def _around(close: CloseUp) -> float:
     """Mean level over the floor on a circle around a region's centre, of twice its radius."""
     sums, where, total, count = close.sums, close.where, 0.0, 0
@@ -219,7 +219,7 @@ def _around(close: CloseUp) -> float:
     return total / max(count, 1)
 
 
-@inner
+@part
 def _plane_shift(close: CloseUp, level: float) -> Center:
     """Where the samples of a mosaic's cell lie on the average: its planes stand a pixel apart.
 
@@ -262,7 +262,7 @@ def _plane_shift(close: CloseUp, level: float) -> Center:
     return x / total, y / total
 
 
-@summing
+@fast_part
 def _add_rims(values: Array, above: Image, here: Image, below: Image, mark: np.int32, sums: Array) -> None:
     """Add a row's samples inside of a region, those of them beside one outside, and those outside beside one inside."""
     inside, inner_rim, outer_rim = _NO, _NO, _NO
@@ -278,7 +278,7 @@ def _add_rims(values: Array, above: Image, here: Image, below: Image, mark: np.i
     sums[2] += outer_rim
 
 
-@summing
+@fast_part
 def _edge(close: CloseUp, high: float) -> float:
     """Width px of a spot's edge, from its region, grown last, to its inside over the `high` level.
 
@@ -304,7 +304,7 @@ def _edge(close: CloseUp, high: float) -> float:
     return float((np.sqrt(area / np.pi) - np.sqrt(inside / np.pi)) * unit)
 
 
-@inner
+@part
 def _steepness(planes: int, edge: float) -> float:
     """How many times the error that the grid leaves to a smooth spot is that of one with an edge so wide.
 
@@ -314,7 +314,7 @@ def _steepness(planes: int, edge: float) -> float:
     return float(min(1.0 + _STEEP * np.exp((_STEEP_PX - wide) / _NARROW_PX), _STEEPEST))
 
 
-@inner
+@part
 def _disagreement(du: float, dv: float, expected: float) -> Cov:
     """Covariance by two estimates of a centre, for what they differ beyond two sigma: its profile is uneven."""
     square = du * du + dv * dv
@@ -322,7 +322,7 @@ def _disagreement(du: float, dv: float, expected: float) -> Cov:
     return share * du * du, share * du * dv, share * dv * dv
 
 
-@inner
+@part
 def _unresolved(sums: Array, q: Array, unit: float) -> Cov:
     """Covariance of a region too long for one light: two that are not told apart, and either may be the one meant."""
     uu, uv, vv = region.moments(sums)
@@ -337,7 +337,7 @@ def _unresolved(sums: Array, q: Array, unit: float) -> Cov:
     return excess * (turn + 0.5 * (uu - vv)), excess * uv, excess * (turn - 0.5 * (uu - vv))
 
 
-@inner
+@part
 def _is_known(spots: Array, n: int) -> bool:
     for k in range(n):
         du, dv = spots[k, fields.U] - spots[n, fields.U], spots[k, fields.V] - spots[n, fields.V]

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import constant, inlined, inner
-from lumidock._kernels.compiling import entry
+from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.detection import fields, peaks, samples, tiles
 from lumidock._kernels.detection.likelihood import dim_glints, dim_small_fry, lamp_probability, weigh_steadiness
 from lumidock._kernels.detection.measure import measure
@@ -26,9 +25,9 @@ _NO_CANDIDATE = 1 << 20  # more than there are
 _OF_TILE = tiles.TILE_PX * tiles.TILE_PX
 _LAST_OF_TILE = _OF_TILE - 1
 _WHITE = _OF_TILE * 255  # nothing is brighter in 8 bits
-_NONE = _STAY = constant(0)
-_STEP = constant(1)  # along rows or columns
-_SWEPT_STEP = constant(2)  # of rows, in a tracked search's sweep: the smallest spot still has half its height
+_NONE = _STAY = 0
+_STEP = 1  # along rows or columns
+_SWEPT_STEP = 2  # of rows, in a tracked search's sweep: the smallest spot still has half its height
 
 
 @entry
@@ -90,7 +89,7 @@ def see(
     return n, whole
 
 
-@inner
+@part
 def _candidates(picture: Picture, known: tiles.Map, rects: Indices, most: int, q: Array) -> int:
     """Write the tiles in `rects` (n, 4) that may hold a light's peak to `known.found`; returns how many."""
     peak, level, sigma, spread, found = known.peak, known.level, known.sigma, known.spread, known.found
@@ -118,7 +117,7 @@ def _candidates(picture: Picture, known: tiles.Map, rects: Indices, most: int, q
     return _most_outstanding(found, count, most, known.queue[0])
 
 
-@inner
+@part
 def _measured(picture: Picture, known: tiles.Map, close: CloseUp, count: int, most: int, q: Array, spots: Array) -> int:
     """Measure the `count` candidates, the brightest first, until `most` are; returns how many spots there are."""
     planes, peak, seen, found = picture.planes, known.peak, known.seen, known.found
@@ -149,7 +148,7 @@ def _measured(picture: Picture, known: tiles.Map, close: CloseUp, count: int, mo
     return n
 
 
-@inner
+@part
 def _most_outstanding(found: Array, count: int, most: int, scratch: Array) -> int:
     """Move the `most` candidates that stand out most to the front; returns how many there are."""
     if count <= most:
@@ -165,7 +164,7 @@ def _most_outstanding(found: Array, count: int, most: int, scratch: Array) -> in
     return kept
 
 
-@inner
+@part
 def _brightest_first(planes: int, peak: Array, clipped: int, found: Array, count: int, queue: Array) -> None:
     """Queue the candidates by their tile's largest value, the brightest first: number less `_NO_CANDIDATE` times that.
 
@@ -189,7 +188,7 @@ def _brightest_first(planes: int, peak: Array, clipped: int, found: Array, count
         gap = 1 if gap == 2 else int(gap / 2.2)
 
 
-@inner
+@part
 def _insert(waiting: Array, count: int, value: float) -> int:
     """Insert into the first `count` values, of which the smallest is the last; returns the new count."""
     k = count
@@ -200,7 +199,7 @@ def _insert(waiting: Array, count: int, value: float) -> int:
     return count + 1
 
 
-@inner
+@part
 def _brightest(picture: Picture, p: int, i: int, j: int) -> tuple[int, int, int]:
     """Row, column and rank of a tile's brightest pixel of a map, the first of several."""
     top, left, step, mosaic = i * tiles.TILE_PX, j * tiles.TILE_PX, 1, picture.planes == 4
@@ -225,7 +224,7 @@ def _brightest(picture: Picture, p: int, i: int, j: int) -> tuple[int, int, int]
     return top + at // tiles.TILE_PX, left + at % tiles.TILE_PX, best // _OF_TILE
 
 
-@inner
+@part
 def _peak_pixel(
     picture: Picture, p: int, row: int, column: int, best: int, saturated: bool, clipped: int
 ) -> tuple[int, int, bool]:
@@ -249,7 +248,7 @@ def _peak_pixel(
     return row, column, best > 0
 
 
-@inner
+@part
 def _middle_of_run(
     picture: Picture, p: int, v: int, u: int, dv: int, du: int, rank: int, most: int, farthest: int
 ) -> int:
@@ -267,7 +266,7 @@ def _middle_of_run(
     return (v if dv else u) + (before + after) // (2 * pitch) * pitch
 
 
-@inlined
+@part
 def _rank(picture: Picture, p: int, v: int, u: int, most: int = _NO_LIMIT) -> int:
     """Order of a pixel in map `p`: by its value there, among equals by all channels, which tell a saturated core.
 

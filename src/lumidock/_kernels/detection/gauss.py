@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import constant, inner, summing
+from lumidock._kernels.compiling import fast_part, part
 from lumidock._kernels.detection import patch, samples
 from lumidock._kernels.detection.patch import CloseUp
 from lumidock.datatypes import Array
@@ -18,14 +18,14 @@ _FITTED = 2.0  # of the residuals' degrees of freedom, that the position takes u
 # lines of scratch: along the window's two sides, of the samples of one plane, and of those of each of four
 _EX, _EY, _X, _Y, _G, _VARIANCE, _WEIGHT, _SIGNAL, _VALUE, _USED = 0, 1, 2, 3, 4, 5, 6, 7, 8, 12
 _AMPLITUDE, _GROUND = 0, 1
-_FIRST, _ALONE, _ZERO = constant(0), constant(-1), np.float32(0.0)
+_FIRST, _ALONE, _ZERO = 0, -1, np.float32(0.0)
 Window = tuple[int, int, int, int, int, int]  # left, top, columns and rows of its samples, their planes and distance
 Step = tuple[np.float32, np.float32, np.float32]  # column and row of the first sample, and of the next ones, in widths
 Six = tuple[float, float, float, float, float, float]
 _NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-@inner
+@part
 def fit(
     close: CloseUp,
     planes: int,
@@ -70,7 +70,7 @@ def fit(
     return s, u, v, uu * scale_up, uv * scale_up, vv * scale_up
 
 
-@inner
+@part
 def averaging(shared: float, width: float) -> float:
     """Variance of a centre by noise that neighbours share, over that by as much noise of each sample on its own.
 
@@ -79,7 +79,7 @@ def averaging(shared: float, width: float) -> float:
     return float(shared / (1.0 + (shared - 1.0) / (4.0 * np.pi * width * width)) ** 2)
 
 
-@inner
+@part
 def _read(close: CloseUp, planes: int, center: tuple[float, float], reach: int, clipped: float) -> tuple[Window, bool]:
     """Write the samples around `center`, row by row, without their level and slope, to the lines of scratch.
 
@@ -123,7 +123,7 @@ def _read(close: CloseUp, planes: int, center: tuple[float, float], reach: int, 
     return (left + unit * j, top + unit * i, n, m, parts, unit), int(count) == parts * m * n
 
 
-@inner
+@part
 def _normal_equations(
     close: CloseUp, window: Window, u: float, v: float, s: float, variance: float, signal_noise: float
 ) -> tuple[Six, tuple[float, float, float]]:
@@ -153,7 +153,7 @@ def _normal_equations(
     return (s00, s01, s02, s11, s12, s22), (r0, r1, r2)
 
 
-@inner
+@part
 def _profile(lines: Array, a: float, b: float, step: float, s: float, n: int, m: int) -> None:
     """Write the profile of one plane's samples, row by row, the first one `a`, `b` from the centre."""
     ex, ey, g = lines[_EX], lines[_EY], lines[_G]
@@ -165,7 +165,7 @@ def _profile(lines: Array, a: float, b: float, step: float, s: float, n: int, m:
             row[j] = ex[j] * e
 
 
-@summing
+@fast_part
 def _amplitude(z: Array, used: Array, g: Array, variance: np.float32, shot: np.float32) -> tuple[float, float]:
     """Least-squares amplitude and background of one plane under the present profile, of the samples `used`.
 
@@ -187,7 +187,7 @@ def _amplitude(z: Array, used: Array, g: Array, variance: np.float32, shot: np.f
     return 0.0, e / max(c, 1e-12)
 
 
-@summing
+@fast_part
 def _equations(
     z: Array,
     used: Array,
@@ -234,7 +234,7 @@ def _equations(
     ), side
 
 
-@inner
+@part
 def _without_plane(
     S: Six, own: tuple[float, float, float], of_g: tuple[float, float, float], of_1: tuple[float, float, float]
 ) -> Six:
@@ -255,7 +255,7 @@ def _without_plane(
     )
 
 
-@inner
+@part
 def _misfit(
     close: CloseUp,
     window: Window,
@@ -298,7 +298,7 @@ def _misfit(
     return max((_PRIOR_DOF + dof * found) / (_PRIOR_DOF + max(dof - fitted, _LEFT * dof)), at_least)
 
 
-@summing
+@fast_part
 def _residuals(
     lines: Array,
     p: int,
@@ -321,7 +321,7 @@ def _residuals(
         signal[k] = h
 
 
-@summing
+@fast_part
 def _odd(lines: Array, p: int, first: int, last: int, count: int) -> tuple[float, float, float, float]:
     """Sums over samples from `first` on, less those from `last` back, or alone if that is negative; see `_misfit`.
 
@@ -343,7 +343,7 @@ def _odd(lines: Array, p: int, first: int, last: int, count: int) -> tuple[float
     return float(total), float(least), float(weight), float(square)
 
 
-@inner
+@part
 def _solve(S: Six, b: tuple[float, float, float]) -> tuple[float, float, float, bool]:
     """Solution of S x = b, of a symmetric S by its upper triangle, by the adjugate."""
     s00, s01, s02, s11, s12, s22 = S
@@ -360,7 +360,7 @@ def _solve(S: Six, b: tuple[float, float, float]) -> tuple[float, float, float, 
     )
 
 
-@inner
+@part
 def _top_left_of_inverse(S: Six) -> tuple[float, float, float, bool]:
     """The entries uu, uv, vv of the inverse of S (3, 3), by its upper triangle."""
     a, b, c = S[0] - S[2] ** 2 / S[5], S[1] - S[2] * S[4] / S[5], S[3] - S[4] ** 2 / S[5]

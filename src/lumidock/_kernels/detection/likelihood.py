@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import inner
+from lumidock._kernels.compiling import part
 from lumidock._kernels.detection import fields
 from lumidock.datatypes import Array
 
@@ -15,7 +15,7 @@ _STEADY_FLUX = 0.3  # 1 sigma of the logarithm of a lamp's flux from frame to fr
 _APPEARS, _NEW = 0.05, 0.7  # share of the lamps, and of all else, that were not there in the frame before
 
 
-@inner
+@part
 def lamp_probability(spot: Array, q: Array) -> float:
     """Probability of being a lamp, from contrast, shape, size and blur: soft, so that geometry can overrule it."""
     radius = spot[fields.RADIUS]
@@ -32,12 +32,12 @@ def lamp_probability(spot: Array, q: Array) -> float:
     return float(min(max(seen * shape * size * alone * blurred, 0.02), 0.98))
 
 
-@inner
+@part
 def _logistic(x: float) -> float:
     return float(1.0 / (1.0 + np.exp(-x)))
 
 
-@inner
+@part
 def weigh_steadiness(spots: Array, n: int, past: Array, reach_px: float, saw_all: bool) -> None:
     """Make more of spots that were there in the frame before, and less of those that were not if it was all looked at.
 
@@ -57,7 +57,7 @@ def weigh_steadiness(spots: Array, n: int, past: Array, reach_px: float, saw_all
         spots[k, fields.P_LIGHT] = min(max(odds / (1.0 + odds), 0.02), 0.98)
 
 
-@inner
+@part
 def dim_glints(spots: Array, n: int, q: Array, before: Array) -> None:
     """Make little of a spot near a much stronger one that may be a lamp: its reflection on the frame beside it.
 
@@ -81,7 +81,7 @@ def dim_glints(spots: Array, n: int, q: Array, before: Array) -> None:
                 break
 
 
-@inner
+@part
 def dim_small_fry(spots: Array, n: int, q: Array, before: Array) -> None:
     """Make less of spots that are many of a kind, or faint beside the lamps in view.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import constant, inner
+from lumidock._kernels.compiling import part
 from lumidock._kernels.detection import fields, patch, peaks, region, samples, tiles
 from lumidock._kernels.detection.describe import FILTER_PX, describe, holds_another, peak_value, small_snr
 from lumidock._kernels.detection.patch import CloseUp
@@ -12,7 +12,7 @@ from lumidock._kernels.detection.samples import Picture
 from lumidock.datatypes import Array, Image
 
 LEVELS = (0.5, 0.7, 0.85, 0.95)  # shares of the peak at which a spot is cut out, until it is round and alone
-_FARTHER = (constant(4), constant(8), constant(16))  # tiles at which the flanks of a wide light show
+_FARTHER = (4, 8, 16)  # tiles at which the flanks of a wide light show
 _MAX_TILES = 20  # a light is not wider
 _ROUNDS = 4
 _QUICK = 1.45  # sigmas of noise that 3 x 3 pixels must clear; a light worth having clears 1.8
@@ -23,7 +23,7 @@ _MOST_SHARED = 36.0  # samples over which noise is the same; more is a texture
 _LEAST_STEP = 30.0  # levels by which a saturated light stands out in the plane that shows it best
 
 
-@inner
+@part
 def measure(
     picture: Picture,
     known: tiles.Map,
@@ -93,7 +93,7 @@ def measure(
     return int(describe(picture, close, u, v, share, shared, q, spots, n))
 
 
-@inner
+@part
 def _radius(
     picture: Picture,
     known: tiles.Map,
@@ -118,7 +118,7 @@ def _radius(
     return radius
 
 
-@inner
+@part
 def _surroundings(close: CloseUp, reach: float, expected: float, least: float, clipped: bool) -> None:
     """Flatten the close-up by the ring of `reach` px, and write what that says of the surroundings to its `ground`."""
     ground = close.ground
@@ -130,7 +130,7 @@ def _surroundings(close: CloseUp, reach: float, expected: float, least: float, c
     ground[patch.MOVES] = np.sqrt(max(uneven**2 - 2.0 * noise**2, 0.0))
 
 
-@inner
+@part
 def _extent(peak: Image, i: int, j: int, level: Array) -> float:
     """Radius px that the tiles give a spot at half height: of its narrower side, half a tile at least.
 
@@ -158,7 +158,7 @@ def _extent(peak: Image, i: int, j: int, level: Array) -> float:
     return 0.5 * tiles.TILE_PX * min(width, height)
 
 
-@inner
+@part
 def _level(picture: Picture, close: CloseUp, q: Array, spots: Array, n: int) -> float:
     """Grow the spot at the lowest share of its peak where it is round and alone.
 
@@ -189,7 +189,7 @@ def _level(picture: Picture, close: CloseUp, q: Array, spots: Array, n: int) -> 
     return 0.0
 
 
-@inner
+@part
 def _own(seen: Image, close: CloseUp) -> None:
     """Mark the tiles that the grown region touches: nobody looks there again."""
     stamp, sums, where, t = close.stamp, close.sums, close.where, tiles.TILE_PX
@@ -210,7 +210,7 @@ def _own(seen: Image, close: CloseUp) -> None:
                 seen[i, left // t : min(right // t + 1, seen.shape[1])] = 1
 
 
-@inner
+@part
 def _own_plateau(picture: Picture, close: CloseUp, v: int, u: int, reach: float, q: Array, seen: Image) -> None:
     """Mark the tiles of what is too large to be a light, as far as it is as bright as here in every plane."""
     darkest, least = 0, 1e9

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lumidock._kernels import inlined, inner, summing
+from lumidock._kernels.compiling import fast_part, part
 from lumidock._kernels.detection.samples import COS, RING, SIN, Picture, insert, mean
 from lumidock.datatypes import Array, Image, Indices
 
@@ -75,7 +75,7 @@ def close_up() -> CloseUp:
     )
 
 
-@inner
+@part
 def cut(picture: Picture, v: int, u: int, reach: float, side: int, close: CloseUp) -> None:
     """Fill the close-up with the window of `reach` px around a pixel, thinned out to about `side` samples a side."""
     where = close.where
@@ -94,7 +94,7 @@ def cut(picture: Picture, v: int, u: int, reach: float, side: int, close: CloseU
     _mix(picture.planes, close)
 
 
-@inner
+@part
 def _read(rows: Image, picture: Picture, where: Indices, stack: NDArray[np.float32]) -> None:
     left, top, unit, n = where[LEFT], where[TOP], where[UNIT], where[COLUMNS]
     scale, mosaic = np.float32(picture.scale), picture.planes == 4
@@ -119,7 +119,7 @@ def _read(rows: Image, picture: Picture, where: Indices, stack: NDArray[np.float
                     out[j] = scale * np.float32(line[step * j])
 
 
-@inner
+@part
 def _mix(planes: int, close: CloseUp) -> None:
     """Write the weighted mean of the planes to the part."""
     stack, n, weight = close.stack, wide(close.where[COLUMNS]), close.weight
@@ -137,7 +137,7 @@ def _mix(planes: int, close: CloseUp) -> None:
                 out[j] = w0 * a[j] + w1 * b[j] + w2 * c[j] + w3 * d[j]
 
 
-@inner
+@part
 def flatten(close: CloseUp, reach: float) -> tuple[float, float, float]:
     """Level, spread and unevenness (1 sigma) of the ring of `reach` px around the start, without its slope.
 
@@ -191,7 +191,7 @@ def flatten(close: CloseUp, reach: float) -> tuple[float, float, float]:
     return level, spread, _ROOT_TWO * uneven[pairs // 2] / 0.674
 
 
-@inner
+@part
 def smooth(close: CloseUp) -> None:
     """Average with the neighbours by 1 2 1 in either direction: a clipped core is torn by noise, and by interlacing."""
     part, across, last, rows = close.part, close.across, close.where[COLUMNS] - 1, close.where[ROWS]
@@ -208,13 +208,13 @@ def smooth(close: CloseUp) -> None:
             out[j] = _QUARTER * (above[j] + _TWO * here[j] + below[j])
 
 
-@inlined
+@part
 def wide(columns: int) -> int:
     """So many samples, and some more of no meaning that fill what is taken at once."""
     return (columns + 15) & -16
 
 
-@inner
+@part
 def rim_noise(close: CloseUp) -> float:
     """1 sigma of a sample, from second differences along the outer rows of a window; large ones, of edges, left out."""
     columns, rows = close.where[COLUMNS], close.where[ROWS]
@@ -231,7 +231,7 @@ def rim_noise(close: CloseUp) -> float:
     return sigma
 
 
-@summing
+@fast_part
 def _differences(line: Array, limit: float) -> tuple[float, float]:
     """Sum and number of the absolute second differences of every other sample that are not over a limit."""
     total, count, most = np.float32(0.0), np.float32(0.0), np.float32(limit)
@@ -243,7 +243,7 @@ def _differences(line: Array, limit: float) -> tuple[float, float]:
     return float(total), float(count)
 
 
-@inner
+@part
 def bell(first: float, step: float, width: float, n: int, out: Array) -> None:
     """Write a Gaussian of `width` at `n` places `step` apart, the first one `first` from its middle."""
     value = np.exp(-0.5 * (first / width) ** 2)
@@ -254,7 +254,7 @@ def bell(first: float, step: float, width: float, n: int, out: Array) -> None:
         ratio *= ratio_of_ratios
 
 
-@inner
+@part
 def filtered(close: CloseUp, x: float, y: float, width: float, level: float) -> tuple[float, float]:
     """Amplitude of a Gaussian of `width` samples at a place, and how many samples' worth of averaging is in it."""
     reach, part, ex, ey = int(np.ceil(2.5 * width)), close.part, close.lines[0], close.lines[1]

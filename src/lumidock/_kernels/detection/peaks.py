@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lumidock._kernels import constant, inner
+from lumidock._kernels.compiling import part
 from lumidock._kernels.detection.tiles import BLOCK
 from lumidock.datatypes import Array, Image, Indices
 
 _NEARLY = 1.0 - 1e-9  # of a margin that rounding may not raise
-_BESIDE, _FAR = constant(1), constant(4)  # tiles at which the slopes of a wide light show
+_BESIDE, _FAR = 1, 4  # tiles at which the slopes of a wide light show
 _HALO = 40.0  # sigmas over the background that only the halo of something bright reaches beside its peak
 
 
-@inner
+@part
 def candidates(
     peak: Image,
     level: Array,
@@ -51,10 +51,10 @@ def candidates(
                     least[j], margin[j] = value, rise
         if not _worth_a_look(peak, i, least, margin, int(clipped), rect[2], rect[3], worth):
             continue
-        for part in range(len(eight)):
-            if not eight[part]:
+        for piece in range(len(eight)):
+            if not eight[piece]:
                 continue
-            for j in range(rect[2] + 8 * part, min(rect[2] + 8 * part + 8, rect[3])):
+            for j in range(rect[2] + 8 * piece, min(rect[2] + 8 * piece + 8, rect[3])):
                 if not worth[j - rect[2]] or seen[i, j] or count == len(found):
                     continue
                 if peak[i, j] >= clipped and _is_inner(together, i, j, int(clipped)):
@@ -72,7 +72,7 @@ def candidates(
     return count
 
 
-@inner
+@part
 def _worth_a_look(
     peak: Image, i: int, least: Image, margin: Image, clipped: int, first: int, last: int, worth: Image
 ) -> bool:
@@ -101,7 +101,7 @@ def _worth_a_look(
     return True
 
 
-@inner
+@part
 def _drop_flat(here: Image, margin: Image, clipped: np.int32, mark: Image) -> None:
     """Leave only those marks of a row that rise by the `margin`, see `_rises`, or are too near its end to tell."""
     for x in range(_FAR, len(here) - _FAR):
@@ -111,7 +111,7 @@ def _drop_flat(here: Image, margin: Image, clipped: np.int32, mark: Image) -> No
         mark[x] &= beside | far | (np.int32(here[x]) >= clipped)
 
 
-@inner
+@part
 def _stands_out(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
     """Whether a tile is neither on a slope nor on a halo, see `candidates`."""
     if not _rises(peak, i, j, margin, clipped):
@@ -127,7 +127,7 @@ def _stands_out(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
     return over_pairs(peak, i, j, _FAR) >= margin
 
 
-@inner
+@part
 def _rises(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
     """Whether a tile stands out along its row, next to it or a few tiles away: it settles most."""
     w, twice = peak.shape[1], 2 * int(peak[i, j])
@@ -137,7 +137,7 @@ def _rises(peak: Image, i: int, j: int, margin: int, clipped: int) -> bool:
     return twice - int(peak[i, max(j - _FAR, 0)]) - int(peak[i, min(j + _FAR, w - 1)]) >= margin
 
 
-@inner
+@part
 def _is_inner(together: Image, i: int, j: int, clipped: int) -> bool:
     """Whether a tile and all around it are saturated in every map."""
     _, h, w = together.shape
@@ -152,7 +152,7 @@ def _is_inner(together: Image, i: int, j: int, clipped: int) -> bool:
     return True
 
 
-@inner
+@part
 def over_pairs(peak: Image, i: int, j: int, d: int) -> int:
     """Twice the value of a tile less that of two on opposite sides, `d` tiles away, the least of four ways."""
     h, w = peak.shape
@@ -164,7 +164,7 @@ def over_pairs(peak: Image, i: int, j: int, d: int) -> int:
     return 2 * int(peak[i, j]) - most
 
 
-@inner
+@part
 def largest(peak: Image, i: int, j: int) -> int:
     """The largest value of a tile in any map."""
     most = int(peak[0, i, j])

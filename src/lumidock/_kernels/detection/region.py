@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import inlined, inner, summing
+from lumidock._kernels.compiling import fast_part, part
 from lumidock._kernels.detection import patch
 from lumidock._kernels.detection.patch import CloseUp
 from lumidock._kernels.detection.samples import Picture
@@ -17,7 +17,7 @@ _MARKS = (1 << 31) - 1
 _NOTHING, _NO_MARK = np.float32(0.0), np.int32(0)
 
 
-@inner
+@part
 def grow(picture: Picture, close: CloseUp, level: float, clipped: float) -> None:
     """Sum up the connected samples over `level` around the start, coordinates relative to it, into the sums.
 
@@ -74,13 +74,13 @@ def grow(picture: Picture, close: CloseUp, level: float, clipped: float) -> None
     sums[FIRST_COLUMN], sums[LAST_COLUMN], sums[FIRST_ROW], sums[LAST_ROW] = left, right, upper, lower
 
 
-@inlined
+@part
 def _push(stack: Image, top: int, column: int, row: int, behind: int, begun: int, ended: int) -> None:
     """Remember where a run goes through, and the run that it was found from."""
     stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3], stack[top, 4] = column, row, behind, begun, ended
 
 
-@inner
+@part
 def unmark(close: CloseUp, p: int, least: float) -> None:
     """Take what plane `p` shows darker than `least` out of the region grown last."""
     mark, stamp, sums = np.int32(close.where[patch.MARK]), close.stamp, close.sums
@@ -90,7 +90,7 @@ def unmark(close: CloseUp, p: int, least: float) -> None:
                 stamp[i + 1, j + 1] = 0
 
 
-@inner
+@part
 def take_all(close: CloseUp) -> None:
     """Of a region that is a whole window, its columns and rows."""
     sums = close.sums
@@ -98,7 +98,7 @@ def take_all(close: CloseUp) -> None:
     sums[FIRST_ROW], sums[LAST_ROW] = 0.0, close.where[patch.ROWS] - 1
 
 
-@summing
+@fast_part
 def _add_run(
     values: Array, marks: Image, mark: np.int32, a: int, b: int, level: float, clipped: np.float32, sums: Array
 ) -> None:
@@ -123,7 +123,7 @@ def _add_run(
     sums[CLIPPED] += burnt
 
 
-@inner
+@part
 def soften(close: CloseUp, lower: float) -> tuple[float, float]:
     """Give the region grown last a soft edge: weights over `lower`, and a rim of a sample.
 
@@ -167,7 +167,7 @@ def soften(close: CloseUp, lower: float) -> tuple[float, float]:
     return x0 / w0 - x1 / w1, y0 / w0 - y1 / w1
 
 
-@inner
+@part
 def _soft_row(
     values: Array, above: Image, here: Image, below: Image, mark: np.int32, lower: np.float32, taken: Image
 ) -> tuple[float, float, float, float, float]:
@@ -193,7 +193,7 @@ def _soft_row(
     return n, x, xx, w, wx
 
 
-@inner
+@part
 def shape(sums: Array) -> tuple[float, float]:
     """Ratio of the axes of the ellipse with the region's second moments, and the region's area over the ellipse's."""
     n = sums[N]
@@ -203,7 +203,7 @@ def shape(sums: Array) -> tuple[float, float]:
     return np.sqrt(max(half - turn, 1e-12) / (half + turn)), n / area
 
 
-@inner
+@part
 def moments(sums: Array) -> tuple[float, float, float]:
     """Second central moments of the region, of samples that are unit squares."""
     n = sums[N]
@@ -212,7 +212,7 @@ def moments(sums: Array) -> tuple[float, float, float]:
     return uu, (sums[XY] - sums[X] * sums[Y] / n) / n, vv
 
 
-@inner
+@part
 def balance(sums: Array, variance: float) -> tuple[float, float, float, float, float]:
     """A region's weighted centre x, y, relative to its start, and its covariance xx, xy, yy by noise of `variance`."""
     x, y = sums[WX] / sums[W], sums[WY] / sums[W]

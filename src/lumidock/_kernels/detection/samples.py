@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lumidock._kernels import constant, inlined, inner
+from lumidock._kernels.compiling import part
 from lumidock.datatypes import Array, Frame, Image
 
 RING = 24  # samples on a ring
 COS, SIN = np.cos(np.arange(RING) * 2.0 * np.pi / RING), np.sin(np.arange(RING) * 2.0 * np.pi / RING)
 _ROOT_TWO = np.sqrt(2.0)
 _SIXTEEN = 255.0 / 65535.0  # 8-bit levels of a 16-bit step
-_NONE, _SECOND, _LAST = constant(0), constant(1), constant(5)
+_NONE, _SECOND, _LAST = 0, 1, 5
 _LEAST_LOST, _SLACK = 0.4, 0.5  # share of its height that a spot loses to the ring; sigmas of noise left to it
 
 
@@ -42,7 +42,7 @@ def picture(frame: Frame) -> Picture:
     return Picture(rows, deep, planes, 1.0 if deep == 1 else _SIXTEEN, height, width)
 
 
-@inlined
+@part
 def value(picture: Picture, v: int, x: int) -> int:
     """The `x`th number of row `v`."""
     if picture.deep == 1:
@@ -50,7 +50,7 @@ def value(picture: Picture, v: int, x: int) -> int:
     return int(picture.rows[v, 2 * x]) + 256 * int(picture.rows[v, 2 * x + 1])
 
 
-@inlined
+@part
 def sample(picture: Picture, p: int, v: int, u: int) -> float:
     """One sample of plane `p`, in grey levels, at a pixel or, on a mosaic, in the 2 x 2 cell of a pixel."""
     if picture.planes == 1:
@@ -61,7 +61,7 @@ def sample(picture: Picture, p: int, v: int, u: int) -> float:
     return picture.scale * value(picture, v, u)
 
 
-@inner
+@part
 def core_mean(picture: Picture, p: int, v: int, u: int) -> float:
     """Mean of a plane over 3 x 3 of its samples around a pixel."""
     pitch = 2 if picture.planes == 4 else 1
@@ -73,7 +73,7 @@ def core_mean(picture: Picture, p: int, v: int, u: int) -> float:
     return total / count
 
 
-@inner
+@part
 def ring(picture: Picture, v: int, u: int, radius: float, values: Array) -> int:
     """Write twelve samples of each plane on a circle around a pixel to `values` (4, 12), as far as they are inside.
 
@@ -89,7 +89,7 @@ def ring(picture: Picture, v: int, u: int, radius: float, values: Array) -> int:
     return count
 
 
-@inner
+@part
 def is_over(values: Array, count: int, limit: float) -> bool:
     """Whether `ring_level` of a plane's samples is over a limit, without sorting: all but a quarter of them are."""
     low = 0
@@ -98,7 +98,7 @@ def is_over(values: Array, count: int, limit: float) -> bool:
     return low <= count // 4 and count > 0
 
 
-@inner
+@part
 def ring_level(values: Array, count: int) -> float:
     """Mean of the second quarter of a plane's samples on a circle, which are sorted; 0 if there are none.
 
@@ -111,7 +111,7 @@ def ring_level(values: Array, count: int) -> float:
     return mean(values, count // 4, count // 2 + 1)
 
 
-@inner
+@part
 def mean(values: Array, first: int, last: int) -> float:
     """Mean of some of the values."""
     total = 0.0
@@ -120,7 +120,7 @@ def mean(values: Array, first: int, last: int) -> float:
     return total / (last - first)
 
 
-@inner
+@part
 def log_lens_over_bad_pixel(
     picture: Picture, v: int, u: int, radius: float, share: float, noise: float, values: Array
 ) -> float:
@@ -146,7 +146,7 @@ def log_lens_over_bad_pixel(
     return held * (around - 0.5 * held) * 8.0 / noise**2
 
 
-@inner
+@part
 def stands_out(
     picture: Picture, p: int, v: int, u: int, radius: float, noise: float, least: float, small: bool, values: Array
 ) -> bool:
@@ -166,7 +166,7 @@ def stands_out(
     return not whole or core - level + _SLACK * noise >= _LEAST_LOST * (core - far)
 
 
-@inner
+@part
 def _pair_level(picture: Picture, p: int, v: int, u: int, radius: float, means: Array) -> tuple[float, float, bool]:
     """Level and scatter of the means of opposite samples on a ring, which no slope moves; whether it is in view."""
     reach = int(radius + 0.5)
@@ -179,7 +179,7 @@ def _pair_level(picture: Picture, p: int, v: int, u: int, radius: float, means: 
     return mean(means, _SECOND, _LAST), _ROOT_TWO * (means[4] - means[1]) / 1.35, True
 
 
-@inner
+@part
 def weigh(picture: Picture, v: int, u: int, radius: float, weight: Array, values: Array) -> None:
     """Write each plane's `weight` (4,), their sum 1, for a light of about `radius` px at a pixel.
 
@@ -197,7 +197,7 @@ def weigh(picture: Picture, v: int, u: int, radius: float, weight: Array, values
         weight[p] = weight[p] / total if total > 0.0 else 1.0 / picture.planes
 
 
-@inner
+@part
 def weigh_clipped(
     picture: Picture, v: int, u: int, least: float, largest: float, weight: Array, values: Array
 ) -> float:
@@ -234,13 +234,13 @@ def weigh_clipped(
     return smallest
 
 
-@inner
+@part
 def square(weight: Array) -> float:
     """Sum of the squares of the planes' weights (4,)."""
     return weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2 + weight[3] ** 2
 
 
-@inner
+@part
 def mean_by_square(weight: Array, values: Array, power: int) -> float:
     """Mean of a power of the planes' `values` (4,) by the squares of their weights."""
     total = 0.0
@@ -249,7 +249,7 @@ def mean_by_square(weight: Array, values: Array, power: int) -> float:
     return total / square(weight)
 
 
-@inner
+@part
 def insert(ordered: Array, count: int, new: float) -> int:
     """Insert into the first `count` of the sorted values; returns the new count."""
     k = count
@@ -260,7 +260,7 @@ def insert(ordered: Array, count: int, new: float) -> int:
     return count + 1
 
 
-@inner
+@part
 def largest(values: Array) -> float:
     """The largest of the planes' `values` (4,)."""
     return max(max(values[0], values[1]), max(values[2], values[3]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lumidock._kernels import inner
+from lumidock._kernels.compiling import part
 from lumidock._kernels.detection.samples import Picture, value
 from lumidock._kernels.detection.tiles import TILE_PX, Map
 from lumidock.datatypes import Image
@@ -15,7 +15,7 @@ _FLAT_TILES, _PLATEAU, _ALIKE = 4, 6, 16  # tiles with so many samples that only
 _RIPPLE, _ENOUGH = 5.0, 400  # levels that compression leaves on them; tiles that are looked at
 
 
-@inner
+@part
 def saturation(picture: Picture, known: Map) -> float:
     """The grey level from which on a sample is saturated: the usual, or where the brightest spots are flat below it.
 
@@ -44,7 +44,7 @@ def saturation(picture: Picture, known: Map) -> float:
     return min(scale * most - at - _RIPPLE, SATURATED) if top[at] >= _FLAT_TILES else SATURATED
 
 
-@inner
+@part
 def _is_flat(picture: Picture, p: int, i: int, j: int, most: int) -> bool:
     """Whether much of a tile is saturated if its largest sample is: noise and colour leave less of it alike.
 
@@ -61,7 +61,7 @@ def _is_flat(picture: Picture, p: int, i: int, j: int, most: int) -> bool:
     return count >= (_PLATEAU if channels == 3 else _ALIKE)
 
 
-@inner
+@part
 def _largest(row: Image) -> int:
     most = np.uint16(0)
     for j in range(len(row)):

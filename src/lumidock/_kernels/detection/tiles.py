@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lumidock._kernels import constant, inner
+from lumidock._kernels.compiling import part
 from lumidock._kernels.detection import fields
 from lumidock.datatypes import Array, Image, Indices
 
 TILE_PX, BLOCK = 8, 8  # pixels a side of a tile, tiles a side of a block
-_0, _1, _2, _3, _4, _5, _6, _7 = (constant(k) for k in range(8))
+_0, _1, _2, _3, _4, _5, _6, _7 = range(8)
 EVERY = _1  # step of rows
 SPARSE = 4  # one block in so many says how samples share their noise
 TOPS = 24  # grey levels under the brightest, see `saturation`
@@ -52,7 +52,7 @@ class Map(NamedTuple):
     queue: Array
 
 
-@inner
+@part
 def refresh(rows: Image, planes: int, rect: tuple[int, int, int, int], step: int, peak: Image, line: Image) -> None:
     """Write the largest values of each tile of `rect` into `peak` (P, h, w); `rect` is two rows and two columns.
 
@@ -90,13 +90,13 @@ def refresh(rows: Image, planes: int, rect: tuple[int, int, int, int], step: int
             _largest_of_wide_tiles(even, most, peak, i, rect[2])
 
 
-@inner
+@part
 def _row(rows: Image, top: int, k: int) -> int:
     """Row `k` of a tile, or one of its own kind where the picture ends before it."""
     return top + k if top + k < len(rows) else top + (k & 1 if top + 1 < len(rows) else 0)
 
 
-@inner
+@part
 def _max_of_eight(rows: Image, top: int, left: int, line: Image) -> None:
     right = left + len(line)
     a, b = rows[top, left:right], rows[_row(rows, top, _1), left:right]
@@ -107,7 +107,7 @@ def _max_of_eight(rows: Image, top: int, left: int, line: Image) -> None:
         line[x] = max(max(max(a[x], b[x]), max(c[x], d[x])), max(max(e[x], f[x]), max(g[x], h[x])))
 
 
-@inner
+@part
 def _max_of_four(rows: Image, top: int, first: int, step: int, left: int, line: Image) -> None:
     """The larger of every second row of a tile from `first` on; of every fourth with `step` 2."""
     right = left + len(line)
@@ -121,7 +121,7 @@ def _max_of_four(rows: Image, top: int, first: int, step: int, left: int, line: 
         line[x] = max(max(a[x], b[x]), max(c[x], d[x]))
 
 
-@inner
+@part
 def _largest_of_tiles(line: Image, out: Image) -> None:
     for j in range(len(out)):
         largest = line[TILE_PX * j]
@@ -130,7 +130,7 @@ def _largest_of_tiles(line: Image, out: Image) -> None:
         out[j] = largest
 
 
-@inner
+@part
 def _largest_of_corner(line: Image, first: int, out: Image) -> None:
     """The largest of every second value of each tile."""
     for j in range(len(out)):
@@ -138,7 +138,7 @@ def _largest_of_corner(line: Image, first: int, out: Image) -> None:
         out[j] = max(max(line[x], line[x + 2]), max(line[x + 4], line[x + 6]))
 
 
-@inner
+@part
 def _largest_of_wide_tiles(line: Image, most: Image, peak: Image, i: int, left: int) -> None:
     """The same for three channels: the largest of eight pixels from each value on, in one run, then those of tiles."""
     n = len(line) - 21
@@ -154,7 +154,7 @@ def _largest_of_wide_tiles(line: Image, most: Image, peak: Image, i: int, left: 
         a[j], b[j], c[j] = most[x], most[x + 1], most[x + 2]
 
 
-@inner
+@part
 def look(
     rows: Image, line: Image, planes: int, blocks: tuple[int, int], step: int, rects: Indices, count: int, known: Map
 ) -> None:
@@ -178,7 +178,7 @@ def look(
         refresh(rows, planes, (rects[k, 0], rects[k, 1], rects[k, 2], rects[k, 3]), EVERY, peak, line)
 
 
-@inner
+@part
 def clear(seen: Image, rects: Indices) -> None:
     """Forget that tiles of some windows `rects` (n, 4) were seen."""
     for k in range(len(rects)):
@@ -186,7 +186,7 @@ def clear(seen: Image, rects: Indices) -> None:
             seen[i, rects[k, 2] : rects[k, 3]] = 0
 
 
-@inner
+@part
 def windows(expected: Array, before: Array, drift_px: float, h: int, w: int, rects: Indices) -> int:
     """Write the tiles, `rects` (n, 4), around the `expected` places (n, 3), u, v and reach px, and the spots `before`.
 
@@ -213,12 +213,12 @@ def windows(expected: Array, before: Array, drift_px: float, h: int, w: int, rec
     return count
 
 
-@inner
+@part
 def _clip(x: float, most: int) -> int:
     return int(min(max(x, 0.0), float(most)))
 
 
-@inner
+@part
 def area(rects: Indices) -> int:
     """Tiles in all windows together, those in several counted as often."""
     total = 0
@@ -227,7 +227,7 @@ def area(rects: Indices) -> int:
     return total
 
 
-@inner
+@part
 def _noise(even: Image, odd: Image, planes: int, difference: NDArray[np.int32], sigma: Array, by_plane: Array) -> None:
     """The noise of one row of blocks, from an even and, of a mosaic, an odd row of pixels, see `survey`.
 
@@ -254,7 +254,7 @@ def _noise(even: Image, odd: Image, planes: int, difference: NDArray[np.int32], 
             by_plane[0, p, k // SPARSE] = _SIGMA * own
 
 
-@inner
+@part
 def _second_differences(row: Image, step: int, out: NDArray[np.int32]) -> None:
     """Absolute second differences of samples `step` apart."""
     n = max(len(row) - 2 * step, 0)
@@ -263,7 +263,7 @@ def _second_differences(row: Image, step: int, out: NDArray[np.int32]) -> None:
         d[x] = abs(np.int32(a[x]) - np.int32(2) * np.int32(b[x]) + np.int32(c[x]))
 
 
-@inner
+@part
 def _mean(values: NDArray[np.int32], first: int, last: int, step: int) -> float:
     """Mean of every so many of `values`, 0 where there are none."""
     part = values[first : max(last, first)]
@@ -277,7 +277,7 @@ def _mean(values: NDArray[np.int32], first: int, last: int, step: int) -> float:
     return total / max((len(part) + step - 1) // step, 1)
 
 
-@inner
+@part
 def settle(known: Map, least: float, most: float) -> None:
     """Write what a frame's blocks say together.
 
@@ -298,7 +298,7 @@ def settle(known: Map, least: float, most: float) -> None:
         shared[p] = min(max((_median(by_plane[1, p], known.ordered) / max(own, 0.7 * least)) ** 2, 1.0), most)
 
 
-@inner
+@part
 def _second_difference_of_sums(row: Image) -> float:
     """The same of sums of `TILE_PX` neighbours, over the root of their number."""
     count = len(row) // TILE_PX
@@ -315,7 +315,7 @@ def _second_difference_of_sums(row: Image) -> float:
     return total / ((count - 2) * np.sqrt(TILE_PX))
 
 
-@inner
+@part
 def _median(values: Array, ordered: Array) -> float:
     """The median of `values` (m, n), which are put into `ordered`."""
     count = _0
@@ -329,7 +329,7 @@ def _median(values: Array, ordered: Array) -> float:
     return upper if count % 2 else 0.5 * (lower + upper)
 
 
-@inner
+@part
 def select(values: Array, count: int, k: int) -> float:
     """The value that would be at `k` if the first `count` were sorted; they change places (Hoare's selection)."""
     low, high = 0, count - 1
@@ -352,7 +352,7 @@ def select(values: Array, count: int, k: int) -> float:
     return float(values[k])
 
 
-@inner
+@part
 def _levels(peak: Image, b: int, level: Image, middle: Image) -> None:
     """Write the median of the tiles of each block of one row of blocks, row by row and then of those, to `level[b]`."""
     h, w = peak.shape
@@ -375,7 +375,7 @@ def _levels(peak: Image, b: int, level: Image, middle: Image) -> None:
     _middle_of_eight(r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], level[b])
 
 
-@inner
+@part
 def _middle_of_eight(
     a: Image, b: Image, c: Image, d: Image, e: Image, f: Image, g: Image, h: Image, out: Image
 ) -> None:
@@ -386,14 +386,14 @@ def _middle_of_eight(
         out[x] = min(min(max(i, s), max(j, r)), min(max(k, q), max(m, p)))
 
 
-@inner
+@part
 def _sorted_four(a: float, b: float, c: float, d: float) -> tuple[float, float, float, float]:
     a, b, c, d = min(a, b), max(a, b), min(c, d), max(c, d)
     a, c, b, d = min(a, c), max(a, c), min(b, d), max(b, d)
     return a, min(b, c), max(b, c), d
 
 
-@inner
+@part
 def _smoothed(values: Array, out: Array, middle: Array) -> None:
     """Write the median of five columns of the medians of five rows around each of `values` (h, w) to `out`.
 
@@ -411,7 +411,7 @@ def _smoothed(values: Array, out: Array, middle: Array) -> None:
             row[j] = _median_of_five(middle[j], middle[j + 1], middle[j + 2], middle[j + 3], middle[j + 4])
 
 
-@inner
+@part
 def _median_of_five(a: float, b: float, c: float, d: float, e: float) -> float:
     f, g = max(min(a, b), min(c, d)), min(max(a, b), max(c, d))
     return max(min(f, g), min(max(f, g), e))

@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lumidock._kernels import constant
 from lumidock._kernels.compiling import part
 from lumidock._kernels.lens import copy_to, inside
 from lumidock._kernels.pose import light_row, refine, set_pose
@@ -32,7 +31,7 @@ from lumidock.datatypes import Array, Indices
 LOG_2PI = math.log(2.0 * math.pi)
 HUGE = 1e300  # as a log evidence, negative: impossible
 _ELSEWHERE = 8.0  # log odds of two priors that one solution under both cannot reach
-STEPS = constant(6)  # of Gauss-Newton, at most; from a pose that is nearly right two or three are enough
+STEPS = 6  # of Gauss-Newton, at most; from a pose that is nearly right two or three are enough
 
 
 class SearchRules(NamedTuple):

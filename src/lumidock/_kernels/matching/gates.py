@@ -7,14 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lumidock._kernels import constant
 from lumidock._kernels.compiling import part
 from lumidock._kernels.lens import copy_to
 from lumidock._kernels.matching.evidence import HUGE, Candidate, Problem, innovation, survey_var
 from lumidock._kernels.pose import light_row
 from lumidock.datatypes import Array, Indices
 
-ANY = constant(-1)  # layer; or rank that all lights come after
+ANY = -1  # layer; or rank that all lights come after
 _NEAR = 2.0  # gates within which a detection may still come to lie in its gate
 
 

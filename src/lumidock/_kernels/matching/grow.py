@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from lumidock._kernels import constant
 from lumidock._kernels.compiling import part
 from lumidock._kernels.lens import copy_to, invert6
 from lumidock._kernels.matching.evidence import (
@@ -27,8 +26,8 @@ from lumidock._kernels.matching.gates import ANY, Expected, cheapest, expect, ne
 from lumidock._kernels.pose import SAME_TURN, flip, turn
 from lumidock.datatypes import Array, Indices
 
-NONE = constant(0)  # as the least that must be assigned
-_STEPS_MORE, _STEPS_FAR = constant(4), constant(12)  # after one light more; from a pose that may be far off
+NONE = 0  # as the least that must be assigned
+_STEPS_MORE, _STEPS_FAR = 4, 12  # after one light more; from a pose that may be far off
 _BRANCHES, _FIRSTS = 2, 48  # first lights of another layer tried, of so many looked at
 _HOPELESS = 30.0  # log evidence; a flipped pose this far behind is not followed
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lumidock._kernels import constant
 from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.lens import invert6
 from lumidock._kernels.matching.evidence import (
@@ -31,7 +30,7 @@ from lumidock._kernels.matching.grow import NONE, grow
 from lumidock._kernels.pose import SAME_TURN, flip, light_row, turn
 from lumidock.datatypes import Array, Indices
 
-_STEPS_OTHER, _STEPS_EXCHANGED = constant(20), constant(8)
+_STEPS_OTHER, _STEPS_EXCHANGED = 20, 8
 _FAR_GATES = 4.0  # gates within which another assignment is tried
 
 
