@@ -198,7 +198,7 @@ def test_beam_falls_to_half_at_its_half_angle():
         T[:3, :3] = R_DOCK_CAM_HEAD_ON @ np.array(cv2.Rodrigues(np.array([0.0, -angle, 0.0]))[0])
         T[:3, 3] = STATION.p_dock[0] + 5.0 * np.array([np.sin(angle), 0, np.cos(angle)])
         watts = optics.lamp_watts(SCENARIO, STATION, np.ones(len(STATION)), 1.0)
-        seen = optics.lamps(optics.View(lens_of(), T, EXPOSURE_S), STATION, STATION.p_dock, watts, 0.0175)
+        seen = optics.lamps(optics.View(lens_of(), T, EXPOSURE_S), STATION, STATION.p_dock, watts, knobs.Lamps())
         assert seen.lit[0]
         return seen.at_lens[0, 1]
 
@@ -232,7 +232,7 @@ def test_projection_agrees_with_opencv(distortion):
     uv, _ = cv2.projectPoints(STATION.p_dock, so3_log(T_cam_dock[:3, :3]), T_cam_dock[:3, 3], CAMERA.K, distortion)
     watts = np.ones((len(STATION), 3))
     view = optics.View(lens_of(camera=camera), T, EXPOSURE_S)
-    seen = optics.lamps(view, STATION, STATION.p_dock, watts, 0.0175)
+    seen = optics.lamps(view, STATION, STATION.p_dock, watts, knobs.Lamps())
     np.testing.assert_allclose(seen.uv, uv[:, 0], atol=1e-6)
 
 

@@ -228,7 +228,7 @@ def _sim(
         raise InputError("--video: bare detections have no pictures")
     loaded = load_scenario(scenario, tuple(settings or ()))
     require_possible(loaded, detections=detections, video=video)
-    station_file = shipped_or_path("station", station or DEFAULT_STATION)
+    station_file = shipped_or_path("station", station or loaded.station or DEFAULT_STATION)
     dock = load_station(station_file)
     lens = load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))
     prepare_sequence(out, force)

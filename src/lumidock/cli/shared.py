@@ -176,7 +176,7 @@ def simulated(source: str, folder: Path, station: str | None, camera: str | None
     name, colon, seed = source.removeprefix(SIM).rpartition(":")
     name, seed = (name, seed) if colon and seed.isdecimal() else (source.removeprefix(SIM), "0")
     scenario = load_scenario(name, ())
-    station_file = shipped_or_path("station", station or DEFAULT_STATION)
+    station_file = shipped_or_path("station", station or scenario.station or DEFAULT_STATION)
     dock, lens = load_station(station_file), load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))
     prepare_sequence(folder, True)
     copy(station_file, folder / "station.yaml")

@@ -18,7 +18,7 @@ _SNOW_TILE_M = 8.0  # the same particles come again at this distance
 _NEAREST_M, _FAR_M = 0.15, 100.0
 _GLINT_M = 0.006  # radius of a glint
 _ABREAST = np.array([0.9, 0.15, 0.4])  # along which another vehicle's lamps stand
-_LAMP_STEPS = 28
+LAMP_EDGES_M = np.concatenate([[0.0], np.logspace(-1.0, 1.3, 28)])  # steps along the line of sight
 _FORWARD_RAD = np.deg2rad(30.0)  # daylight comes from a cone about this wide
 
 
@@ -127,10 +127,23 @@ def headlamp_w_m2(scenario: Scenario, knobs: Headlamp, p_cam: Array) -> Array:
 
 def daylight_w_m2(scenario: Scenario, height_m: float) -> Array:
     """Downward irradiance (3,) in each band, `height_m` above the dock's origin."""
-    a, b = absorption_scattering(scenario.water)
-    decay = diffuse_attenuation(a, b * backscatter_share(phase_kind(scenario.water)))
     depth = max(scenario.daylight.depth_m - height_m, 0.0)
-    return np.asarray(scenario.daylight.surface_w_m2 * np.exp(-decay * depth))
+    return np.asarray(scenario.daylight.surface_w_m2 * np.exp(-daylight_decay(scenario) * depth))
+
+
+def daylight_decay(scenario: Scenario) -> Array:
+    """Decay (3,) 1/m of daylight with depth in each band."""
+    a, b = absorption_scattering(scenario.water)
+    return diffuse_attenuation(a, b * backscatter_share(phase_kind(scenario.water)))
+
+
+def daylight_sideways(scenario: Scenario, up: Array) -> Array:
+    """Share (..., 3) 1/(m sr) of daylight that a metre of water scatters along rays with the cosine `up` (...) to the
+    vertical, times `daylight.more`.
+    """  # noqa: D205
+    _, b = absorption_scattering(scenario.water)
+    angle = np.maximum(np.arccos(np.clip(up, -1.0, 1.0)), _FORWARD_RAD)
+    return np.asarray(scenario.daylight.more * b * phase_at(phase_kind(scenario.water), angle)[..., None])
 
 
 def daylight_sr(scenario: Scenario, R_dock_cam: Array, height_m: float, rays: Array) -> Array:
@@ -153,18 +166,22 @@ def daylight_sr(scenario: Scenario, R_dock_cam: Array, height_m: float, rays: Ar
 
 def headlamp_sr(scenario: Scenario, knobs: Headlamp, rays: Array) -> Array:
     """Radiance (h, w, 3) W/(m2 sr) of the water in the light of the vehicle's own lamp. Single scattering."""
+    return np.asarray(headlamp_sums(scenario, knobs, rays)[-1])
+
+
+def headlamp_sums(scenario: Scenario, knobs: Headlamp, rays: Array) -> Array:
+    """The same up to each of `LAMP_EDGES_M`, (29, h, w, 3)."""
     a, b = absorption_scattering(scenario.water)
-    kind = phase_kind(scenario.water)
-    edges = np.concatenate([[0.0], np.logspace(-1.0, 1.3, _LAMP_STEPS)])
-    total = np.zeros(rays.shape)
+    kind, edges = phase_kind(scenario.water), LAMP_EDGES_M
+    sums = [np.zeros(rays.shape)]
     for sight, step in zip(0.5 * (edges[1:] + edges[:-1]), np.diff(edges), strict=True):
         p_cam = (rays * sight).reshape(-1, 3)
         way = p_cam - np.array(knobs.offset_m)
         cosine = -(way * rays.reshape(-1, 3)).sum(axis=1) / np.linalg.norm(way, axis=1)
         beta = phase_at(kind, np.arccos(np.clip(cosine, -1.0, 1.0)))
         light = headlamp_w_m2(scenario, knobs, p_cam) * b * np.exp(-(a + b) * sight)
-        total += (light * beta[:, None]).reshape(rays.shape) * step
-    return total
+        sums.append(sums[-1] + (light * beta[:, None]).reshape(rays.shape) * step)
+    return np.array(sums)
 
 
 def add_background(canvas: Canvas, scenario: Scenario, view: View, lamp_sr: Array | None) -> None:

@@ -56,6 +56,7 @@ class Canvas:
     absorption: Array
     scattering: Array
     phase: str
+    range_m: Array | None = None  # (H, W) of the matter in each pixel: it hides the halo of what is behind it
     mosaic: Array = field(init=False)
     mid: Array = field(init=False)
     wide: Array = field(init=False)
@@ -70,6 +71,7 @@ class Canvas:
         self.wide = np.zeros((height, width, channels), np.float32)
         self.mid = np.zeros((height * _WIDE // _MID, width * _WIDE // _MID, channels), np.float32)
         self.mosaic = np.zeros((camera.height, camera.width), np.float32)
+        self.range_m = None
 
     @cached_property
     def wide_uv(self) -> Array:
@@ -154,7 +156,7 @@ class Canvas:
             core.own[...] += self._peak(profile, J, uv, core)
         rows, columns = _around(uv, int(near) + 1, self.mosaic.shape)
         theta = _angles(J, np.arange(columns.start, columns.stop) - uv[0], np.arange(rows.start, rows.stop) - uv[1])
-        patch = profile.at(theta, 0.0, near / focal_px)
+        patch = self._before_matter(profile.at(theta, 0.0, near / focal_px), rows, columns, 1, seen.range_m[i])
         self.mosaic[rows, columns] += self._on_mosaic(rows, columns, patch)
         reach = min(profile.reach_px, far)
         if reach > 0.4 * near:
@@ -162,14 +164,30 @@ class Canvas:
             rows, columns = _around(node, int(reach) // _MID + 1, self.mid.shape)
             du, dv = (np.arange(s.start, s.stop) - c for s, c in zip((columns, rows), node, strict=True))
             theta = _angles(J, du * _MID, dv * _MID)
-            self.mid[rows, columns] += profile.at(theta, near / focal_px, far / focal_px)
+            patch = profile.at(theta, near / focal_px, far / focal_px)
+            self.mid[rows, columns] += self._before_matter(patch, rows, columns, _MID, seen.range_m[i])
         if profile.reach_px > 0.4 * far:
             node = (uv + 0.5) / _WIDE - 0.5
             rows, columns = _around(node, int(profile.reach_px) // _WIDE + 1, self.wide.shape)
             apart = np.linalg.norm(self.wide_rays[rows, columns] - self.lens.rays(uv[None])[0], axis=2)
             scale = self.wide_etendue[rows, columns] * (focal_px**2 / float(self.lens.throughput(uv[None])[0]))
             light = profile.at(2.0 * np.arcsin(0.5 * apart), far / focal_px, np.inf)
+            light = self._before_matter(light, rows, columns, _WIDE, seen.range_m[i])
             self.wide[rows, columns] += light * scale[:, :, None].astype(np.float32)
+
+    def _before_matter(self, light: Array, rows: slice, columns: slice, stride: int, lamp_m: float) -> Array:
+        """Of a halo (V, U, C), what matter leaves: the share of the way to the lamp that lies before it.
+
+        Light that is scattered once comes from all of that way alike.
+        """
+        if self.range_m is None:
+            return light
+        middle = stride // 2
+        nearer = self.range_m[middle::stride, middle::stride] if stride > 1 else self.range_m
+        shape = (rows.stop - rows.start, columns.stop - columns.start)
+        part = nearer[rows, columns]
+        part = np.pad(part, ((0, shape[0] - part.shape[0]), (0, shape[1] - part.shape[1])), mode="edge")
+        return np.asarray(light * np.minimum(part * np.float32(1.0 / lamp_m), np.float32(1.0))[:, :, None])
 
     def _peak(self, profile: Profile, J_ray_uv: Array, uv: Array, core: Core) -> Array:
         """What the halo adds on the pixels of its core, over what it adds at their border."""

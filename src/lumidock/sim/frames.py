@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 
 from lumidock.datatypes import Array, Indices
-from lumidock.geometry import se3_inverse, transform_points
+from lumidock.geometry import se3_exp, se3_inverse, se3_log, transform_points
 from lumidock.sim import around
 from lumidock.sim.canvas import Canvas, Core, Mosaic
 from lumidock.sim.knobs import Fish, Surface
 from lumidock.sim.lens import Lens
+from lumidock.sim.lit import Painter, compact_points, visible_share
 from lumidock.sim.optics import PHOTON_J, Emitters, View, joined, lamp_watts, lamps, on_share
 from lumidock.sim.scenario import Scenario
 from lumidock.sim.sensor import electrons_per_level, hot_pixels, picture, read_out, saturation_e
@@ -46,6 +47,11 @@ class Moment:
     dock: bool = True
     draws: tuple[int, ...] = (0,)
 
+    def shifted(self, lapse_s: float) -> Moment:
+        """The same a little later, as the camera goes on moving."""
+        way = se3_log(self.T_cam_later) * (lapse_s / self.exposure_s)
+        return replace(self, t_s=self.t_s + lapse_s, T_dock_cam=self.T_dock_cam @ se3_exp(way))
+
     def rng(self, what: int) -> np.random.Generator:
         """Draws that stay the same through a run."""
         return np.random.default_rng([*self.draws, what])
@@ -53,11 +59,15 @@ class Moment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
-    """Expected electrons (H, W), everything that was drawn, the first M of it the station's lamps, and its SNR (N,)."""
+    """Expected electrons (H, W), everything that was drawn, the first M of it the station's lamps, and its SNR (N,).
+
+    `reflections` (R, 2) px are compact bright points on matter.
+    """
 
     electrons: Array
     seen: Emitters
     snr: Array
+    reflections: Array
 
 
 class Studio:
@@ -68,6 +78,7 @@ class Studio:
         self.scenario, self.station, self.lens = scenario, station, lens
         self.canvas = Canvas(lens, Mosaic.of(scenario.output), a, b, phase_kind(scenario.water))
         shape = (lens.camera.height, lens.camera.width)
+        self.painter = Painter(scenario, station, lens, self.canvas.colors) if scenario.matter.is_any else None
         self.hot_at, self.hot_e_s = hot_pixels(scenario.sensor, shape, np.random.default_rng([*draws, 20]))
 
     @cached_property
@@ -79,14 +90,18 @@ class Studio:
     def shoot(self, moment: Moment) -> Shot:
         """Expose one frame."""
         self.canvas.clear()
-        seen = self._emitters(moment)
+        seen, watts = self._emitters(moment)
+        reflections: Array = np.empty((0, 2))
+        if self.painter is not None:
+            seen, reflections = self._draw_matter(self.painter, moment, seen, watts)
         cores = self.canvas.add(seen, self._smear(moment, seen))
-        around.add_background(self.canvas, self.scenario, self._view(moment), self.lamp_sr)
+        if self.painter is None:
+            around.add_background(self.canvas, self.scenario, self._view(moment), self.lamp_sr)
         electrons = self.canvas.expected()
         self._occlude(moment, electrons, cores)
         rows, columns = self.hot_at
         electrons[rows, columns] += (self.hot_e_s * moment.exposure_s).astype(np.float32)
-        return Shot(electrons, seen, np.array([self._snr(electrons, core) for core in cores]))
+        return Shot(electrons, seen, np.array([self._snr(electrons, core) for core in cores]), reflections)
 
     def develop(self, shot: Shot, rng: np.random.Generator) -> np.ndarray:
         """The picture of a shot, with its noise: (H, W, 3) bgr8, or (H, W) of the other kinds of pixels."""
@@ -95,13 +110,28 @@ class Studio:
     def _view(self, moment: Moment) -> View:
         return View(self.lens, moment.T_dock_cam, moment.exposure_s, moment.t_s)
 
-    def _emitters(self, moment: Moment) -> Emitters:
-        """Everything that shines; the station's lamps first."""
+    def _draw_matter(self, painter: Painter, moment: Moment, seen: Emitters, watts: Array) -> tuple[Emitters, Array]:
+        """Put matter on the canvas; returns the emitters less what it hides, and its compact bright points (R, 2)."""
+        moves = self.scenario.lens.motion
+        later = moment.T_cam_later if moves else np.eye(4)
+        drawn = painter.draw(self._view(moment), moment.p_dock, watts, later, moment.rng(21))
+        self.canvas.mosaic[...] = drawn.electrons
+        self.canvas.range_m = drawn.range_m
+        share = visible_share(drawn.solids, seen, self.scenario.lamps.window_radius_m)
+        share[seen.kind == "injected"] = 1.0
+        seen = replace(seen, core=seen.core * share)
+        apart = compact_points(drawn.electrons, self.scenario.sensor.read_noise_e)
+        lamps = seen.uv[seen.lit & (seen.core > 0.0)]
+        near = np.linalg.norm(apart[:, None] - lamps[None], axis=2) < 3.0 + seen.window_px[seen.lit & (seen.core > 0.0)]
+        return seen, apart[~near.any(axis=1)]
+
+    def _emitters(self, moment: Moment) -> tuple[Emitters, Array]:
+        """Everything that shines, the station's lamps first, and the power (M, 3) W of those in each band."""
         scenario, station, knobs, view = self.scenario, self.station, self.scenario.around, self._view(moment)
         p_dock, radius_m = moment.p_dock, scenario.lamps.window_radius_m
         duty = on_share(scenario.lamps.pwm_hz, scenario.lamps.pwm_duty, moment.t_s, moment.exposure_s)
         watts = lamp_watts(scenario, station, moment.transmission, duty)
-        own = lamps(view, station, p_dock, watts, radius_m)
+        own = lamps(view, station, p_dock, watts, scenario.lamps)
         shining = ~np.isin(np.arange(len(station)), moment.dark)
         parts = [replace(own, lit=own.lit & shining & moment.dock)]
         watts = watts * shining[:, None]
@@ -116,7 +146,7 @@ class Studio:
             parts.append(around.snow(knobs.snow, scenario, view, moment.rng(13)))
         if len(moment.spurious):
             parts.append(_spurious(own, moment.spurious))
-        return joined(parts)
+        return joined(parts), watts * moment.dock
 
     def _smear(self, moment: Moment, seen: Emitters) -> Array:
         """How far (N, 2) px each emitter moves during the exposure."""

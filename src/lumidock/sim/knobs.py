@@ -85,6 +85,7 @@ class Lamps(Section):
     window_radius_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.0175  # 15-20 mm
     layers: Literal["all", "front", "rear"] = "all"  # which of them shine; rear is all but the first seen
     dim: Probability = 1.0  # share of their power
+    side_share: Probability = 0.0  # of the power that window and housing throw about, evenly into all directions
     fouling: Shares = (1.0, 1.0)  # transmission of each lamp's window, drawn for a run
     swap_colors: bool = False  # the layers in reverse order have each other's colours
     pwm_hz: NonNegativeFloat = 0.0  # 0 is direct current; power_w of the station is that while on
@@ -216,6 +217,9 @@ class Sensor(Section):
     hot_e_s: Lengths = (2e4, 5e5)  # electrons a second of each
 
 
+_NO_VIDEO = ("none", "full", "0-255")
+
+
 class Output(Section):
     """What is written of each picture."""
 
@@ -224,6 +228,12 @@ class Output(Section):
     quality: Annotated[int, Field(ge=1, le=100)] = 95  # of JPEG
     pattern: Literal["rggb", "bggr", "grbg", "gbrg"] = "rggb"  # of the mosaic
     color: bool = True  # False: a sensor without a mosaic
+    white_balance: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (1.0, 1.0, 1.0)  # gains of B, G, R
+    # interlaced video: two fields of alternate rows in one frame, or the even rows alone, which halves the height
+    fields: Literal["none", "woven", "single"] = "none"
+    field_s: PositiveFloat = 0.02  # between the two fields: 0.02 s at 25 frames a second, 0.0167 s at 30
+    chroma: Literal["full", "half"] = "full"  # half: 4:2:0, colour at half the width and height, through BT.601
+    levels: Literal["0-255", "16-235"] = "0-255"  # 16-235: of video that nobody expanded
 
     @model_validator(mode="after")
     def _file_can_hold_it(self) -> Self:
@@ -231,6 +241,8 @@ class Output(Section):
             raise ValueError(f"pixels: {self.pixels} needs file: png")
         if not self.color and self.pixels not in ("mono8", "mono16"):
             raise ValueError(f"pixels: a sensor without colour gives no {self.pixels}")
+        if self.pixels not in ("bgr8", "mono8") and (self.fields, self.chroma, self.levels) != _NO_VIDEO:
+            raise ValueError(f"fields, chroma and levels of video: pixels have to be bgr8 or mono8, not {self.pixels}")
         return self
 
 

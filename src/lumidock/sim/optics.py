@@ -9,6 +9,7 @@ import numpy as np
 from lumidock.datatypes import Array
 from lumidock.geometry import se3_inverse, transform_points
 from lumidock.sim.detections import emission_cosine, shown_layers
+from lumidock.sim.knobs import Lamps
 from lumidock.sim.lens import Lens
 from lumidock.sim.scenario import Scenario
 from lumidock.sim.water import BAND_NM
@@ -72,10 +73,14 @@ def beam_exponent(beam_deg: Array | float) -> Array:
     return np.asarray(np.log(0.5) / np.log(np.cos(np.deg2rad(np.minimum(beam_deg, 179.0)) / 2.0)))
 
 
-def intensity(power_w: Array, beam_deg: Array, cosine: Array) -> Array:
-    """Radiant intensity (N,) W/sr at the `cosine` of the angle to the axis: P (n + 1) / 2 pi cos^n."""
+def intensity(power_w: Array, beam_deg: Array, cosine: Array, side_share: float = 0.0) -> Array:
+    """Radiant intensity (N,) W/sr at the `cosine` of the angle to the axis: P (n + 1) / 2 pi cos^n.
+
+    Of the power, `side_share` goes evenly into all directions.
+    """
     n = beam_exponent(beam_deg)
-    return np.asarray(power_w * (n + 1.0) / (2.0 * np.pi) * np.maximum(cosine, 0.0) ** n)
+    beam = np.asarray(power_w * (n + 1.0) / (2.0 * np.pi) * np.maximum(cosine, 0.0) ** n)
+    return beam if side_share == 0.0 else (1.0 - side_share) * beam + side_share * power_w / (4.0 * np.pi)
 
 
 def emitters(
@@ -138,8 +143,8 @@ def on_share(pwm_hz: float, duty: float, start_s: float, exposure_s: float) -> f
     return (on_until(start_s + exposure_s) - on_until(start_s)) / exposure_s
 
 
-def lamps(view: View, station: Station, p_dock: Array, watts: Array, radius_m: float) -> Emitters:
+def lamps(view: View, station: Station, p_dock: Array, watts: Array, knobs: Lamps) -> Emitters:
     """The station's M lamps, which stand at `p_dock` (M, 3) and have `watts` (M, 3) in each band."""
     cosine = emission_cosine(p_dock, station.axis, view.T_dock_cam[:3, 3])
-    watt_sr = intensity(np.ones(len(watts)), station.beam_deg, cosine)[:, None] * watts
-    return emitters("lamp", view, view.p_cam(p_dock), watt_sr, radius_m)
+    watt_sr = intensity(np.ones(len(watts)), station.beam_deg, cosine, knobs.side_share)[:, None] * watts
+    return emitters("lamp", view, view.p_cam(p_dock), watt_sr, knobs.window_radius_m)

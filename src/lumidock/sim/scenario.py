@@ -31,6 +31,7 @@ from lumidock.sim.knobs import (
     Stream,
     Water,
 )
+from lumidock.sim.matter import Matter
 from lumidock.yamlfile import read_mapping, validate
 
 R_DOCK_CAM_HEAD_ON = np.diag([1.0, -1.0, -1.0])
@@ -146,11 +147,13 @@ class Scenario(Section):
 
     name: str = "approach"
     about: str = ""
+    station: str | None = None  # shipped station that it is made for, where that is not the paper's cage
     path: Path3D = Path3D()
     water: Water = Water()
     daylight: Daylight = Daylight()
     lamps: Lamps = Lamps()
     around: Around = Around()
+    matter: Matter = Matter()
     lens: Lens = Lens()
     sensor: Sensor = Sensor()
     output: Output = Output()

@@ -59,6 +59,9 @@ def picture(raw: NDArray[np.uint16], sensor: Sensor, output: Output) -> np.ndarr
     if output.pixels == "bayer8":
         return np.right_shift(raw, _MONO16_SHIFT).astype(np.uint8)
     developed = cv2.demosaicing(raw, _TO_BGR[output.pattern]) if output.color else raw
+    if output.color and output.white_balance != (1.0, 1.0, 1.0):
+        gains = np.array(output.white_balance, np.float32)
+        developed = np.minimum(np.rint(developed * gains), LEVELS).astype(np.uint16)
     if output.color and output.pixels != "bgr8":
         developed = cv2.cvtColor(developed, cv2.COLOR_BGR2GRAY)
     if output.pixels == "mono16":

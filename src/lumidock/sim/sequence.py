@@ -30,6 +30,7 @@ from lumidock.sim.optics import Emitters
 from lumidock.sim.scenario import Scenario
 from lumidock.sim.schedule import Schedule, controlled, exposed, metered, schedule_of
 from lumidock.sim.stream import OVER_EXPOSED, Row, rows_of
+from lumidock.sim.video import as_video, seen_by_field, woven
 from lumidock.sim.water import green_index
 from lumidock.station import Station
 
@@ -191,8 +192,9 @@ def _taken(plan: Schedule, row: Row) -> tuple[bytes, _Written]:
     studio, moment = plan.studio(row.shows), plan.moment(row.shows)
     if row.fault == "over_exposed":
         moment = replace(moment, exposure_s=moment.exposure_s * OVER_EXPOSED)
-    shot = studio.shoot(moment)
-    image = studio.develop(shot, np.random.Generator(np.random.SFC64([plan.seed, 9, row.shows])))
+    rng = np.random.Generator(np.random.SFC64([plan.seed, 9, row.shows]))
+    shot, image = _exposed(studio, moment, rng)
+    image = as_video(image, plan.scenario.output)
     if row.fault in ("black", "white"):
         image[...] = 0 if row.fault == "black" else np.iinfo(image.dtype).max
     content = encoded(image, plan.scenario.output)
@@ -200,6 +202,22 @@ def _taken(plan: Schedule, row: Row) -> tuple[bytes, _Written]:
         content = content[: len(content) // 2]
     lost = row.fault in ("black", "white", "half_written")
     return content, _truth_of(studio, shot, lost)
+
+
+def _exposed(studio: Studio, moment: Moment, rng: np.random.Generator) -> tuple[Shot, np.ndarray]:
+    """The shot of one frame and its picture; of two fields the places of the lamps are those in the middle of them."""
+    if studio.scenario.output.fields != "woven":
+        shot = studio.shoot(moment)
+        return shot, studio.develop(shot, rng)
+    half_s, m = 0.5 * studio.scenario.output.field_s, len(studio.station)
+    first = studio.shoot(moment.shifted(-half_s))
+    even = studio.develop(first, rng)
+    electrons = first.electrons.copy()
+    second = studio.shoot(moment.shifted(half_s))
+    uv = first.seen.uv.copy()
+    uv[:m] = 0.5 * (first.seen.uv[:m] + second.seen.uv[:m])
+    shot = replace(first, electrons=electrons, seen=replace(first.seen, uv=uv))
+    return shot, woven(even, studio.develop(second, rng))
 
 
 def encoded(image: np.ndarray, output: Output) -> bytes:
@@ -219,19 +237,20 @@ def file_of(row: Row, scenario: Scenario) -> str:
 def _truth_of(studio: Studio, shot: Shot, lost: bool) -> _Written:
     """What truth says of one picture; in one that is `lost` nothing is visible."""
     seen, m = shot.seen, len(studio.station)
+    rows = np.array([1.0, 0.5 if studio.scenario.output.fields == "single" else 1.0])  # of what is written
+    uv = seen.uv * rows
     snr = np.zeros(len(seen)) if lost else shot.snr
     lights: list[Line] = [
         [light, f"{u:.4f}", f"{v:.4f}", int(s > _VISIBLE_SNR), f"{s:.2f}"]
-        for light, (u, v), s in zip(studio.station.ids, seen.uv[:m], snr[:m], strict=True)
+        for light, (u, v), s in zip(studio.station.ids, uv[:m], snr[:m], strict=True)
         if np.isfinite([u, v]).all()
     ]
     noted = (snr > _NOTED_SNR) | (seen.kind == "injected")
     noted[:m] = False
-    spurious: list[Line] = [
-        [str(seen.kind[i]), f"{seen.uv[i, 0]:.4f}", f"{seen.uv[i, 1]:.4f}"] for i in np.flatnonzero(noted)
-    ]
-    hot = studio.hot_at[::-1].T if not lost else studio.hot_at[::-1].T[:0]
-    spurious += [["hot_pixel", f"{u:.4f}", f"{v:.4f}"] for u, v in hot]
+    spurious: list[Line] = [[str(seen.kind[i]), f"{uv[i, 0]:.4f}", f"{uv[i, 1]:.4f}"] for i in np.flatnonzero(noted)]
+    shown = slice(0) if lost else slice(None)
+    for kind, places in (("reflection", shot.reflections), ("hot_pixel", studio.hot_at[::-1].T)):
+        spurious += [[kind, f"{u:.4f}", f"{v:.4f}"] for u, v in places[shown] * rows]
     return _Written(lights, spurious)
 
 
@@ -239,7 +258,8 @@ def _write_truth(plan: Schedule, rows: list[Row], written: dict[Row, _Written], 
     """Calibration, stamps and truth, a row for each frame of the sequence."""
     scenario = plan.scenario
     lens = plan.studio(0).lens
-    save_camera(calibrated_in_water(lens, plan.camera), out / "camera.yaml")
+    written_camera = seen_by_field(calibrated_in_water(lens, plan.camera), scenario.output)
+    save_camera(written_camera, out / "camera.yaml")
     raw = scenario.output.pixels.startswith("bayer")
     columns = ("frame", "file", "t_ns", *(("encoding",) if raw else ()))
     encoding = [f"bayer_{scenario.output.pattern}{scenario.output.pixels.removeprefix('bayer')}"] if raw else []

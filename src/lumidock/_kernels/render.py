@@ -1,0 +1,356 @@
+"""A picture of matter in water: the first hit of every sample, shaded only as finely as the light changes."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lumidock._kernels import inner
+from lumidock._kernels.compiling import entry
+from lumidock._kernels.raycast import BOX, CELLS, FAR_M, RING, Solids, between, hit, list_blockers, may_hit
+from lumidock._kernels.shading import (
+    BANDS,
+    DIFFUSE,
+    GLOSSY,
+    PARTS,
+    WATER,
+    RunDraws,
+    lobe,
+    paint,
+    reflected,
+    through_water,
+)
+from lumidock.datatypes import Array, Indices
+
+BLOCK = 16  # samples a side of what is shaded at once at most
+_SHARP = 30.0  # exponent of a curved surface's glossy lobe from which on parts of more than `_FINE` could miss its peak
+_FINE = 4
+_FAINTS = 4.0  # of `World.faint`, what is added to that: less than the read noise
+_TOLERANCE = 0.03  # relative error of the light in the middle of a part that is interpolated
+
+
+class Sight(NamedTuple):
+    """How samples look.
+
+    `rays` (m, n, 3) in `cam` and `etendue` (m, n) sr of a sample at every BLOCK-th one; electrons `gain` (C, 3) of each
+    channel per W/(m2 sr) and sr of each band; the angle `spread` between opposite corners of a block and the angle
+    `step` between samples, rad; how many samples lie between two columns of `Medium.lamp_sr`, `coarse`.
+    """
+
+    rays: Array
+    etendue: Array
+    gain: Array
+    spread: float
+    step: float
+    coarse: float
+
+
+class Scratch(NamedTuple):
+    """Room for one block.
+
+    `rays` (B, B, 3), `etendue` (B, B); which solid and face was hit, `what` (B, B), at which range, `far` (B, B); the
+    `light` (B, B, 9) of samples; solids that the block may show, `some` (S,); parts that wait, `stack` (64, 3).
+    """
+
+    rays: Array
+    etendue: Array
+    what: Indices
+    far: Array
+    light: Array
+    some: Indices
+    stack: Indices
+
+
+class Picture(NamedTuple):
+    """What is drawn; its sides are whole blocks.
+
+    `electrons` (H, W, C), the ranges `range_m` (H, W) of what is seen, and the electrons of matter alone, without those
+    of the water before it, as means over `cells` (h, w, C), which are zero at first.
+    """
+
+    electrons: NDArray[np.float32]
+    range_m: NDArray[np.float32]
+    cells: NDArray[np.float32]
+
+
+@inner
+def _aim(sight: Sight, row: int, column: int, own: Scratch) -> None:
+    """Rays and etendue of a block's samples, between those of its corners."""
+    rays, step = sight.rays, 1.0 / BLOCK
+    for i in range(BLOCK):
+        fv = i * step
+        x = rays[row, column, 0] * (1.0 - fv) + rays[row + 1, column, 0] * fv
+        y = rays[row, column, 1] * (1.0 - fv) + rays[row + 1, column, 1] * fv
+        z = rays[row, column, 2] * (1.0 - fv) + rays[row + 1, column, 2] * fv
+        e = sight.etendue[row, column] * (1.0 - fv) + sight.etendue[row + 1, column] * fv
+        to_x = (rays[row, column + 1, 0] * (1.0 - fv) + rays[row + 1, column + 1, 0] * fv - x) * step
+        to_y = (rays[row, column + 1, 1] * (1.0 - fv) + rays[row + 1, column + 1, 1] * fv - y) * step
+        to_z = (rays[row, column + 1, 2] * (1.0 - fv) + rays[row + 1, column + 1, 2] * fv - z) * step
+        to_e = (sight.etendue[row, column + 1] * (1.0 - fv) + sight.etendue[row + 1, column + 1] * fv - e) * step
+        for j in range(BLOCK):
+            dx, dy, dz = x + to_x * j, y + to_y * j, z + to_z * j
+            scale = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
+            own.rays[i, j, 0], own.rays[i, j, 1], own.rays[i, j, 2] = dx * scale, dy * scale, dz * scale
+            own.etendue[i, j] = e + to_e * j
+
+
+@inner
+def _cast(solids: Solids, spread: float, own: Scratch) -> None:
+    """The first hit of every sample of a block."""
+    count, middle = 0, own.rays[BLOCK // 2, BLOCK // 2]
+    for s in range(len(solids.kind)):
+        if may_hit(solids, s, 0.0, 0.0, 0.0, middle[0], middle[1], middle[2], spread):
+            own.some[count] = s
+            count += 1
+    for i in range(BLOCK):
+        for j in range(BLOCK):
+            dx, dy, dz = own.rays[i, j]
+            near, what = FAR_M, -1
+            for k in range(count):
+                s = own.some[k]
+                t, face = hit(solids, s, 0.0, 0.0, 0.0, dx, dy, dz)
+                if 0.0 < t < near:
+                    near, what = t, 4 * s + face
+            own.far[i, j], own.what[i, j] = near, what
+
+
+@inner
+def _shade(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, i: int, j: int) -> None:
+    """The light of one sample."""
+    what, t = own.what[i, j], own.far[i, j]
+    dx, dy, dz = own.rays[i, j]
+    if what < 0:
+        for band in range(PARTS):
+            own.light[i, j, band] = 0.0
+    else:
+        reflected(world, what >> 2, what & 3, dx, dy, dz, t, own.light, i, j)
+    u, v = (place[1] + j) / sight.coarse, (place[0] + i) / sight.coarse
+    through_water(world.medium, dx, dy, dz, t, u, v, own.light, i, j)
+
+
+@inner
+def _uniform(own: Scratch, top: int, left: int, side: int) -> bool:
+    what = own.what[top, left]
+    for i in range(top, top + side):
+        for j in range(left, left + side):
+            if own.what[i, j] != what:
+                return False
+    return True
+
+
+@inner
+def _blended(own: Scratch, top: int, left: int, side: int, i: int, j: int, band: int) -> float:
+    last = side - 1
+    fv, fu, light = (i - top) / last, (j - left) / last, own.light
+    high = light[top, left, band] * (1.0 - fu) + light[top, left + last, band] * fu
+    low = light[top + last, left, band] * (1.0 - fu) + light[top + last, left + last, band] * fu
+    return high * (1.0 - fv) + low * fv
+
+
+@inner
+def _smooth(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, part: tuple[int, int, int]) -> bool:
+    """Whether the light in the middle of a part is what its corners say."""
+    top, left, side = part
+    last = side - 1
+    for i in (top, top + last):
+        for j in (left, left + last):
+            _shade(world, sight, place, own, i, j)
+    if side == _FINE and _flat(world.solids, own.what[top, left]):
+        return True
+    i, j = top + side // 2, left + side // 2
+    _shade(world, sight, place, own, i, j)
+    for band in range(PARTS):
+        value = own.light[i, j, band]
+        if abs(_blended(own, top, left, side, i, j, band) - value) > _TOLERANCE * value + _FAINTS * world.faint:
+            return False
+    return True
+
+
+@inner
+def _fill(own: Scratch, top: int, left: int, side: int) -> None:
+    last = side - 1
+    for band in range(PARTS):
+        a, b = own.light[top, left, band], own.light[top, left + last, band]
+        c, d = own.light[top + last, left, band], own.light[top + last, left + last, band]
+        for i in range(side):
+            fv = i / last
+            value, end = a * (1.0 - fv) + c * fv, b * (1.0 - fv) + d * fv
+            step = (end - value) / last
+            for j in range(side):
+                own.light[top + i, left + j, band] = value + step * j
+
+
+@inner
+def _flat(solids: Solids, what: int) -> bool:
+    return what < 0 or solids.kind[what >> 2] == BOX or solids.kind[what >> 2] == RING
+
+
+@inner
+def _shiny(world: RunDraws, what: int) -> bool:
+    k = world.solids.surface[what >> 2]
+    return world.surfaces.gloss[k] > 0.0 and world.surfaces.shininess[k] > _SHARP
+
+
+@inner
+def _shade_edge(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, top: int, left: int) -> None:
+    """The light of a small part that shows several surfaces; all samples of a flat one get that of its first."""
+    for i in range(top, top + _FINE):
+        for j in range(left, left + _FINE):
+            what, found = own.what[i, j], -1
+            if _flat(world.solids, what):
+                for k in range((i - top) * _FINE + j - left):
+                    if own.what[top + k // _FINE, left + k % _FINE] == what:
+                        found = k
+                        break
+            if found < 0:
+                _shade(world, sight, place, own, i, j)
+                continue
+            for band in range(PARTS):
+                own.light[i, j, band] = own.light[top + found // _FINE, left + found % _FINE, band]
+
+
+@inner
+def _near_lamp(world: RunDraws, own: Scratch, top: int, left: int, side: int) -> bool:
+    """Whether a lamp is within twice a part's diagonal of its middle, so that its peak could be missed."""
+    last = side - 1
+    a, b = own.far[top, left], own.far[top + last, left + last]
+    across2 = 0.0
+    for axis in range(3):
+        across2 += (own.rays[top, left, axis] * a - own.rays[top + last, left + last, axis] * b) ** 2
+    i, j = top + side // 2, left + side // 2
+    t, p = own.far[i, j], world.lights.p_cam
+    for lamp in range(len(p)):
+        apart2 = 0.0
+        for axis in range(3):
+            apart2 += (own.rays[i, j, axis] * t - p[lamp, axis]) ** 2
+        if apart2 < 4.0 * across2:
+            return True
+    return False
+
+
+@inner
+def _shade_block(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch) -> None:
+    """The light of every sample, from the corners of the largest parts in which it changes evenly."""
+    own.stack[0, 0], own.stack[0, 1], own.stack[0, 2] = 0, 0, BLOCK
+    waiting = 1
+    while waiting > 0:
+        waiting -= 1
+        top, left, side = own.stack[waiting, 0], own.stack[waiting, 1], own.stack[waiting, 2]
+        even = _uniform(own, top, left, side)
+        if side == _FINE and not even:
+            _shade_edge(world, sight, place, own, top, left)
+            continue
+        if side == 2:
+            for i in range(top, top + side):
+                for j in range(left, left + side):
+                    _shade(world, sight, place, own, i, j)
+            continue
+        what = own.what[top, left]
+        if even and what >= 0:
+            peaked = side > _FINE and _shiny(world, what) and not _flat(world.solids, what)
+            even = not (peaked or _near_lamp(world, own, top, left, side))
+        if even and _smooth(world, sight, place, own, (top, left, side)):
+            _fill(own, top, left, side)
+            continue
+        half = side // 2
+        for a in range(2):
+            for b in range(2):
+                own.stack[waiting, 0], own.stack[waiting, 1] = top + a * half, left + b * half
+                own.stack[waiting, 2] = half
+                waiting += 1
+
+
+@inner
+def _expose(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, picture: Picture) -> None:
+    """Write a block's electrons and ranges into the picture."""
+    surfaces, gain, cells = world.surfaces, sight.gain, picture.cells
+    side = len(picture.electrons) // len(cells)
+    share = 1.0 / (side * side)
+    for i in range(BLOCK):
+        row, cell_row = place[0] + i, (place[0] + i) // side
+        for j in range(BLOCK):
+            what, t, scale = own.what[i, j], own.far[i, j], own.etendue[i, j]
+            column = place[1] + j
+            picture.range_m[row, column] = t
+            light = own.light[i, j]
+            for channel in range(len(gain)):
+                seen = gain[channel, 0] * light[WATER] + gain[channel, 1] * light[WATER + 1]
+                picture.electrons[row, column, channel] = (seen + gain[channel, 2] * light[WATER + 2]) * scale
+            if what < 0:
+                continue
+            s, cell_column = what >> 2, column // side
+            k = world.solids.surface[s]
+            dx, dy, dz = own.rays[i, j]
+            other, factor = paint(world, s, what & 3, dx * t, dy * t, dz * t, sight.step * t)
+            own_part, other_part = factor * (1.0 - other), factor * other
+            for band in range(BANDS):
+                albedo = surfaces.albedo[k, band] * own_part + surfaces.second[k, band] * other_part
+                light[GLOSSY + band] += min(albedo, 1.0) * light[DIFFUSE + band]
+            for channel in range(len(gain)):
+                matter = gain[channel, 0] * light[GLOSSY] + gain[channel, 1] * light[GLOSSY + 1]
+                matter = (matter + gain[channel, 2] * light[GLOSSY + 2]) * scale
+                picture.electrons[row, column, channel] += matter
+                cells[cell_row, cell_column, channel] += matter * share
+
+
+@entry
+def render(world: RunDraws, sight: Sight, own: Scratch, picture: Picture) -> None:
+    """Draw the picture; `world.blockers` is filled first."""
+    list_blockers(world.solids, world.lights.p_cam, world.blockers)
+    for row in range(len(picture.electrons) // BLOCK):
+        for column in range(picture.electrons.shape[1] // BLOCK):
+            place = (row * BLOCK, column * BLOCK)
+            _aim(sight, row, column, own)
+            _cast(world.solids, sight.spread, own)
+            _shade_block(world, sight, place, own)
+            _expose(world, sight, place, own, picture)
+
+
+@entry
+def seen_from_origin(solids: Solids, p_cam: Array, clear_m: Array, seen: Indices) -> None:
+    """Set `seen` (N,) to 1 where nothing lies between the origin and `clear_m` (N,) before `p_cam` (N, 3)."""
+    everything = np.arange(-1, len(solids.kind))
+    everything[0] = len(solids.kind)
+    for k in range(len(p_cam)):
+        x, y, z = p_cam[k]
+        far = math.sqrt(x * x + y * y + z * z)
+        seen[k] = 0 if between(solids, everything, 0.0, 0.0, 0.0, x / far, y / far, z / far, far - clear_m[k]) else 1
+
+
+@entry
+def first_hits(solids: Solids, rays: Array, range_m: Array, which: Indices) -> None:
+    """Range m and solid (-1 without one) that each of `rays` (N, 3) from the origin meets first, tried one by one."""
+    for k in range(len(rays)):
+        range_m[k], which[k] = FAR_M, -1
+        for s in range(len(solids.kind)):
+            t, _ = hit(solids, s, 0.0, 0.0, 0.0, rays[k, 0], rays[k, 1], rays[k, 2])
+            if 0.0 < t < range_m[k]:
+                range_m[k], which[k] = t, s
+
+
+@entry
+def lobes(shininess: Array, cosine: Array, out: Array) -> None:
+    """The glossy lobe 1/sr of each exponent (N,) and cosine (N,)."""
+    for k in range(len(out)):
+        out[k] = lobe(shininess[k], cosine[k])
+
+
+def no_blockers(lamps: int, solids: int) -> NDArray[np.int16]:
+    """Room for what each lamp has in each direction."""
+    return np.zeros((lamps, CELLS, solids + 1), np.int16)
+
+
+def scratch(solids: int) -> Scratch:
+    """Room for one block in a world of so many solids."""
+    return Scratch(
+        rays=np.zeros((BLOCK, BLOCK, 3)),
+        etendue=np.zeros((BLOCK, BLOCK)),
+        what=np.zeros((BLOCK, BLOCK), np.int64),
+        far=np.zeros((BLOCK, BLOCK)),
+        light=np.zeros((BLOCK, BLOCK, PARTS)),
+        some=np.zeros(max(solids, 1), np.int64),
+        stack=np.zeros((64, 3), np.int64),
+    )

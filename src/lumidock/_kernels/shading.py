@@ -1,0 +1,285 @@
+"""The light that matter sends to the camera: lamps and daylight on diffuse and glossy surfaces, through water.
+
+Bands are those of `sim.water`. Everything stands in the frame `cam`, so that every line of sight starts at the origin.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lumidock._kernels import inner
+from lumidock._kernels.raycast import BOX, Solids, between, cell_of, normal, to_local
+from lumidock.datatypes import Array, Indices
+
+PLAIN, TILES, SECTORS, STRIPES = range(4)
+BANDS = 3
+DIFFUSE, GLOSSY, WATER, PARTS = 0, 3, 6, 9  # where the parts of a sample's light begin, three bands each
+_PER_PI = 1.0 / math.pi
+_OFF_SURFACE_M = 5e-4  # from where a shadow ray starts
+_NOTHING = 0.02  # share of `World.faint` below which a lamp adds nothing that could be seen
+# share of daylight that a wall gets from the side, and a ceiling from below: radiance distribution and irradiance
+# reflectance of coastal water. Source: C. Mobley, Light and Water, 1994, ch. 10
+_SIDE, _BELOW = 0.3, 0.05
+
+
+class Lights(NamedTuple):
+    """L lamps.
+
+    Places `p_cam` (L, 3) m and `axis` (L, 3); radiant intensity W/sr in each band on the axis, `peak` (L, 3), which
+    falls as the `exponent` (L,) of the cosine, and `even` (L, 3), which all directions get; `radius_m` (L,) of the
+    window.
+    """
+
+    p_cam: Array
+    axis: Array
+    peak: Array
+    even: Array
+    exponent: Array
+    radius_m: Array
+
+
+class Surfaces(NamedTuple):
+    """K surfaces.
+
+    Diffuse reflectance `albedo` (K, 3), and that of the pattern's other part, `second` (K, 3); reflectance of the
+    glossy lobe, `gloss` (K,), and its exponent, `shininess` (K,); `pattern` (K,), its `size_m` (K,) and the `share`
+    (K,) of its other part; relative depth `mottle` (K,) of stains and their size `mottle_m` (K,).
+    """
+
+    albedo: Array
+    second: Array
+    gloss: Array
+    shininess: Array
+    pattern: Indices
+    size_m: Array
+    share: Array
+    mottle: Array
+    mottle_m: Array
+
+
+class Medium(NamedTuple):
+    """The water and what lights it.
+
+    Attenuation `beam` (3,) 1/m; daylight below the surface, `surface` (3,) W/m2, its `decay` (3,) 1/m, the upward
+    direction `up` (3,) and the camera's `depth_m`; what a metre of water scatters of daylight toward the camera,
+    `sideways` (N, 3) 1/(m sr), for N cosines to `up` from -1 to 1; the light of the vehicle's lamp that is scattered
+    on the way, `lamp_sr` (T, h, w, 3) W/(m2 sr), up to the ranges `edge_m` (T,), on a coarse grid.
+    """
+
+    beam: Array
+    surface: Array
+    decay: Array
+    up: Array
+    depth_m: float
+    sideways: Array
+    lamp_sr: Array
+    edge_m: Array
+
+
+class RunDraws(NamedTuple):
+    """All that a line of sight meets, and the irradiance W/m2 `faint` below which no shadow is looked for.
+
+    `blockers` (L, CELLS, S + 1) lists what each lamp has in each direction, `noise` (n, n) are values in [-1, 1) for
+    stains, n a power of two.
+    """
+
+    solids: Solids
+    surfaces: Surfaces
+    lights: Lights
+    medium: Medium
+    faint: float
+    blockers: NDArray[np.int16]
+    noise: Array
+
+
+@inner
+def lobe(shininess: float, cosine: float) -> float:
+    """Normalised Blinn-Phong: reflected over incident light 1/sr, of a lobe that reflects all of what comes head-on.
+
+    Source: J. Blinn, SIGGRAPH 1977; its integral over the hemisphere is 8 pi (2^(-n/2) + n) / ((n + 2) (n + 4)).
+    """
+    n = shininess
+    scale = (n + 2.0) * (n + 4.0) / (8.0 * math.pi * (2.0 ** (-0.5 * n) + n))
+    return scale * max(cosine, 0.0) ** n
+
+
+@inner
+def daylight(medium: Medium, band: int, height_m: float, cosine: float) -> float:
+    """Irradiance W/m2 of a surface `height_m` above the camera, whose normal has this `cosine` to the vertical."""
+    down = medium.surface[band] * math.exp(-medium.decay[band] * max(medium.depth_m - height_m, 0.0))
+    return down * (_SIDE + ((1.0 - _SIDE) if cosine > 0.0 else (_SIDE - _BELOW)) * cosine)
+
+
+@inner
+def reflected(
+    world: RunDraws, s: int, face: int, dx: float, dy: float, dz: float, t: float, out: Array, i: int, j: int
+) -> None:
+    """Put into `out[i, j]` (9,) what leaves a hit at `t` m toward the camera, W/(m2 sr), in each band.
+
+    First the diffuse radiance over the albedo, then the glossy radiance.
+    """
+    solids, lights, medium = world.solids, world.lights, world.medium
+    x, y, z = dx * t, dy * t, dz * t
+    nx, ny, nz = normal(solids, s, face, x, y, z)
+    if nx * dx + ny * dy + nz * dz > 0.0:
+        nx, ny, nz = -nx, -ny, -nz
+    up = medium.up
+    height, rise = up[0] * x + up[1] * y + up[2] * z, up[0] * nx + up[1] * ny + up[2] * nz
+    for band in range(BANDS):
+        out[i, j, DIFFUSE + band] = daylight(medium, band, height, rise) * _PER_PI
+        out[i, j, GLOSSY + band] = 0.0
+    k = solids.surface[s]
+    for lamp in range(len(lights.exponent)):
+        p = lights.p_cam[lamp]
+        lx, ly, lz = p[0] - x, p[1] - y, p[2] - z
+        facing = lx * nx + ly * ny + lz * nz
+        if facing <= 0.0:
+            continue
+        r2 = lx * lx + ly * ly + lz * lz
+        r = math.sqrt(r2)
+        lx, ly, lz, facing = lx / r, ly / r, lz / r, facing / r
+        axis = lights.axis[lamp]
+        ahead = -(lx * axis[0] + ly * axis[1] + lz * axis[2])
+        beam = ahead ** lights.exponent[lamp] if ahead > 0.0 else 0.0
+        # E = pi L a^2 / (r^2 + a^2) on the axis of a diffuse disc of radius a, which has I = pi a^2 L
+        scale = facing / (r2 + lights.radius_m[lamp] ** 2)
+        most = 0.0
+        for band in range(BANDS):
+            most = max(most, beam * lights.peak[lamp, band] + lights.even[lamp, band])
+        if most * scale <= _NOTHING * world.faint:
+            continue
+        if most * scale > world.faint:
+            reach = r - lights.radius_m[lamp]
+            ox, oy, oz = x + nx * _OFF_SURFACE_M, y + ny * _OFF_SURFACE_M, z + nz * _OFF_SURFACE_M
+            if between(solids, world.blockers[lamp, cell_of(-lx, -ly, -lz)], ox, oy, oz, lx, ly, lz, reach):
+                continue
+        bright = 0.0
+        if world.surfaces.gloss[k] > 0.0:
+            hx, hy, hz = lx - dx, ly - dy, lz - dz
+            cosine = (hx * nx + hy * ny + hz * nz) / math.sqrt(hx * hx + hy * hy + hz * hz)
+            bright = world.surfaces.gloss[k] * lobe(world.surfaces.shininess[k], cosine)
+        for band in range(BANDS):
+            power = beam * lights.peak[lamp, band] + lights.even[lamp, band]
+            if power > 0.0:
+                light = power * scale * math.exp(-medium.beam[band] * r)
+                out[i, j, DIFFUSE + band] += light * _PER_PI
+                out[i, j, GLOSSY + band] += light * bright
+
+
+@inner
+def through_water(
+    medium: Medium, dx: float, dy: float, dz: float, t: float, u: float, v: float, out: Array, i: int, j: int
+) -> None:
+    """Attenuate `out[i, j]` (9,) over `t` m, and put into its last part what the water on the way scatters.
+
+    `u`, `v` is the place on the grid of `lamp_sr`. Daylight is integrated in closed form, as `sim.around` does.
+    """
+    rise = dx * medium.up[0] + dy * medium.up[1] + dz * medium.up[2]
+    length = min(t, max(medium.depth_m, 0.01) / rise) if rise > 1e-3 else t
+    place = min(max((rise + 1.0) * 0.5 * (len(medium.sideways) - 1), 0.0), len(medium.sideways) - 1.001)
+    row = int(place)
+    part = place - row
+    for band in range(BANDS):
+        kept = math.exp(-medium.beam[band] * t)
+        out[i, j, DIFFUSE + band] *= kept
+        out[i, j, GLOSSY + band] *= kept
+        scattered = (1.0 - part) * medium.sideways[row, band] + part * medium.sideways[row + 1, band]
+        day = medium.surface[band] * math.exp(-medium.decay[band] * max(medium.depth_m, 0.0))
+        rate = medium.beam[band] - medium.decay[band] * rise
+        if abs(rate) < 1e-6:
+            rate = 1e-6
+        along = -math.expm1(-min(rate * length, 50.0)) / rate
+        out[i, j, WATER + band] = day * scattered * along
+    if len(medium.edge_m) > 0:
+        _add_lamp(medium, t, u, v, out, i, j)
+
+
+@inner
+def _add_lamp(medium: Medium, t: float, u: float, v: float, out: Array, i: int, j: int) -> None:
+    """Add the scattered light of the vehicle's lamp, linear in range and across the grid."""
+    edges, lamp_sr = medium.edge_m, medium.lamp_sr
+    step = 1
+    while step < len(edges) - 1 and edges[step] < t:
+        step += 1
+    w = min(max((t - edges[step - 1]) / (edges[step] - edges[step - 1]), 0.0), 1.0)
+    height, width = lamp_sr.shape[1:3]
+    u, v = min(max(u, 0.0), width - 1.001), min(max(v, 0.0), height - 1.001)
+    column, row = int(u), int(v)
+    fu, fv = u - column, v - row
+    for band in range(BANDS):
+        total = 0.0
+        for a in range(2):
+            for b in range(2):
+                near, far = lamp_sr[step - 1, row + a, column + b, band], lamp_sr[step, row + a, column + b, band]
+                weight = (fv if a else 1.0 - fv) * (fu if b else 1.0 - fu)
+                total += weight * (near + w * (far - near))
+        out[i, j, WATER + band] += total
+
+
+@inner
+def _stains(noise: Array, x: float, y: float) -> float:
+    """Smooth noise in [-1, 1]: random values at integers, blended. Source: K. Perlin, SIGGRAPH 1985."""
+    ix, iy = math.floor(x), math.floor(y)
+    fx, fy = x - ix, y - iy
+    fx, fy = fx * fx * (3.0 - 2.0 * fx), fy * fy * (3.0 - 2.0 * fy)
+    last = len(noise) - 1
+    a, b, c, d = int(ix) & last, int(iy) & last, (int(ix) + 1) & last, (int(iy) + 1) & last
+    top = noise[b, a] * (1.0 - fx) + noise[b, c] * fx
+    low = noise[d, a] * (1.0 - fx) + noise[d, c] * fx
+    return top * (1.0 - fy) + low * fy
+
+
+@inner
+def paint(world: RunDraws, s: int, face: int, x: float, y: float, z: float, footprint_m: float) -> tuple[float, float]:
+    """Share of the pattern's other part at a point of solid `s`, and the factor by which stains change the albedo.
+
+    `footprint_m` is the size of a sample there: what is finer is drawn as its mean.
+    """
+    surfaces, k = world.surfaces, world.solids.surface[s]
+    if surfaces.pattern[k] == PLAIN and surfaces.mottle[k] == 0.0:
+        return 0.0, 1.0
+    lx, ly, lz = to_local(world.solids, s, x, y, z)
+    a, b = lx, ly
+    if world.solids.kind[s] == BOX and face == 0:
+        a, b = ly, lz
+    elif world.solids.kind[s] == BOX and face == 1:
+        a, b = lx, lz
+    other = 0.0
+    size, share = surfaces.size_m[k], surfaces.share[k]
+    if surfaces.pattern[k] == TILES:
+        gap = 1.0 - (1.0 - _line(a, size, share, footprint_m)) * (1.0 - _line(b, size, share, footprint_m))
+        other = gap
+    elif surfaces.pattern[k] == SECTORS:
+        radius = max(math.sqrt(lx * lx + ly * ly), 1e-6)
+        other = _line(math.atan2(ly, lx) * radius, size * radius, share, footprint_m)
+    elif surfaces.pattern[k] == STRIPES:
+        other = _line(lz, size, share, footprint_m)
+    factor = 1.0
+    if surfaces.mottle[k] > 0.0:
+        scale, depth = surfaces.mottle_m[k], surfaces.mottle[k]
+        noise = 0.0
+        for octave in range(3):
+            if scale > footprint_m:
+                shift = 17.3 * octave + 5.7 * s
+                noise += depth * _stains(world.noise, a / scale + shift, b / scale + shift)
+            scale, depth = 0.35 * scale, 0.6 * depth
+        factor = max(1.0 + noise, 0.05)
+    return other, factor
+
+
+@inner
+def _line(place: float, period: float, share: float, footprint: float) -> float:
+    """How much of a `footprint` around a place is in the lines of a grating, whose lines start at whole periods."""
+    if footprint >= period:
+        return share
+    start = (place - 0.5 * footprint) / period
+    whole = math.floor(start)
+    low, high = start - whole, start - whole + footprint / period
+    covered = max(min(high, share) - low, 0.0)
+    if high > 1.0:
+        covered += min(high - 1.0, share)
+    return min(covered / (footprint / period), 1.0)
