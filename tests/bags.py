@@ -37,14 +37,20 @@ def compressed(t_ns, data, form="png"):
     return make
 
 
-def info(t_ns, camera, model=None):
+def info(t_ns, camera, model=None, *, frame_id="cam_optical", roi=(0, 0, 0, 0), **changes):
+    """A CameraInfo message as a function of the store; `changes` are its fields under their ROS 2 names."""
+
     def make(store):
         Info, Roi = (store.types[f"sensor_msgs/msg/{name}"] for name in ("CameraInfo", "RegionOfInterest"))
         K = np.asarray(camera.K, float)
         P = np.hstack([K, np.zeros((3, 1))]).reshape(-1)
-        numbers = [np.asarray(camera.distortion, float), K.reshape(-1), np.eye(3).reshape(-1), P]
-        roi = Roi(0, 0, 0, 0, False)
-        return Info(header(store, t_ns), camera.height, camera.width, model or camera.model, *numbers, 0, 0, roi)
+        fields = {"d": np.asarray(camera.distortion, float), "k": K.reshape(-1), "r": np.eye(3).reshape(-1), "p": P}
+        fields |= {"binning_x": 0, "binning_y": 0, "height": camera.height, "width": camera.width} | changes
+        numbers = [np.asarray(fields[name], float) for name in "dkrp"]
+        x, y, width, height = roi
+        stamp, window = header(store, t_ns, frame_id=frame_id), Roi(x, y, height, width, False)
+        size, binning = (fields["height"], fields["width"]), (fields["binning_x"], fields["binning_y"])
+        return Info(stamp, *size, model or camera.model, *numbers, *binning, window)
 
     return make
 

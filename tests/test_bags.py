@@ -20,8 +20,9 @@ from numpy.testing import assert_array_equal
 
 from lumidock.camera import Camera
 from lumidock.datatypes import MOSAICS, Frame, Unusable
-from lumidock.errors import InputError, LumidockError
+from lumidock.errors import LumidockError
 from lumidock.streams.inspection import inspect
+from lumidock.streams.source import Reading, delayed
 from lumidock.streams.sources import open_source
 
 CAMERA = Camera(8, 6, np.array([[10.0, 0, 3], [0, 11.0, 2], [0, 0, 1]]), "plumb_bob", np.array([0.1, 0, 0, 0.01, 0]))
@@ -123,10 +124,10 @@ def test_an_encoding_is_read(tmp_path, kind, encoding):
 def test_twelve_bits_in_sixteen_get_their_full_scale(tmp_path, encoding):
     pixels = np.array([[0, 1, 2048, 4095], [4096, 65535, 100, 7]], np.uint16)  # more than twelve bits are white
     wanted = [[0, 16, 32768, 65520], [65520, 65520, 1600, 112]]
-    (item,) = open_source(make(tmp_path, "mcap", [(TOPIC, 1, bags.raw(1, pixels, encoding))]), bits=12).items()
+    (item,) = open_source(make(tmp_path, "mcap", [(TOPIC, 1, bags.raw(1, pixels, encoding))]), Reading(bits=12)).items()
     assert_array_equal(item.image, wanted)
     cv2.imwrite(str(tmp_path / "0.png"), pixels)
-    (item,) = open_source(tmp_path, 1.0, bits=12).items() if encoding == "mono16" else (item,)
+    (item,) = open_source(tmp_path, Reading(1.0, bits=12)).items() if encoding == "mono16" else (item,)
     assert_array_equal(item.image, wanted)
 
 
@@ -167,10 +168,10 @@ def test_one_of_several_topics_has_to_be_chosen(tmp_path):
     path = make(tmp_path, "mcap", [*series(), *copy, *series(MONO[:2], "/rear/image_raw")])
     with refused(path, "choose with --topic; there are /front/image_raw, /rear/image_raw"):
         open_source(path)
-    assert len(list(open_source(path, topic="/rear/image_raw").items())) == 2
-    assert len(list(open_source(path, topic=f"{TOPIC}/compressed").items())) == 1
+    assert len(list(open_source(path, Reading(topic="/rear/image_raw")).items())) == 2
+    assert len(list(open_source(path, Reading(topic=f"{TOPIC}/compressed")).items())) == 1
     with refused(path, "no pictures there"):
-        open_source(path, topic="/none")
+        open_source(path, Reading(topic="/none"))
 
 
 def test_the_calibration_is_the_one_beside_the_pictures(tmp_path):
@@ -181,6 +182,56 @@ def test_the_calibration_is_the_one_beside_the_pictures(tmp_path):
         *series(),
     ]
     assert_array_equal(open_source(make(tmp_path, "mcap", messages)).calibration.K, CAMERA.K)
+
+
+def test_one_clock_holds_for_a_topic(tmp_path):
+    now = 1_700_000_000 * SECOND
+    messages = [(TOPIC, now + i, bags.raw(t, MONO[0], "mono8")) for i, t in enumerate([now + 5, 0, now + 7])]
+    items = list(open_source(make(tmp_path, "mcap", messages)).items())
+    assert [(type(item), item.t_ns) for item in items] == [(Frame, now + 5), (Unusable, None), (Frame, now + 7)]
+    assert items[1].reason == "bad_stamp"
+    simulated = [(TOPIC, now + i, bags.raw(i * SECOND, MONO[0], "mono8")) for i in range(3)]
+    assert [item.t_ns for item in open_source(make(tmp_path / "sim", "mcap", simulated)).items()] == [
+        0,
+        SECOND,
+        2 * SECOND,
+    ]
+
+
+def test_the_time_of_a_simulation_is_named(tmp_path):
+    now = 1_700_000_000 * SECOND
+    messages = [(TOPIC, now + i, bags.raw(5 * SECOND + i, MONO[0], "mono8")) for i in range(3)]
+    source = open_source(make(tmp_path, "mcap", messages))
+    assert [item.t_ns for item in source.items()] == [5 * SECOND + i for i in range(3)]
+    assert "simulation" in source.notes[0]
+    messages = [(TOPIC, now + i, bags.raw(now - 3600 * SECOND, MONO[0], "mono8")) for i in range(3)]
+    assert "-3600 s off" in open_source(make(tmp_path / "off", "mcap", messages)).notes[0]
+
+
+def test_a_delay_is_taken_off_every_stamp(tmp_path):
+    source = open_source(make(tmp_path, "mcap", series()))
+    assert [i.t_ns for i in delayed(source, 40.0).items()] == [i.t_ns - 40_000_000 for i in source.items()]
+
+
+def test_a_bag_that_is_still_written_opens(tmp_path, good):
+    path = tmp_path / "dive.bag.active"
+    path.write_bytes(good["bag"])
+    assert len(list(open_source(path).items())) == 6
+
+
+def test_a_bag_packed_as_a_file_says_how_to_open_it(tmp_path):
+    (tmp_path / "dive_0.db3.zstd").write_bytes(zstandard.compress(b"x"))
+    (tmp_path / "metadata.yaml").touch()
+    for path in (tmp_path, tmp_path / "dive_0.db3.zstd"):
+        with refused(path, "zstd -d dive_0.db3.zstd"):
+            open_source(path)
+
+
+def test_several_bags_in_a_folder_are_not_one(tmp_path):
+    for name in ("monday", "tuesday"):
+        (tmp_path / f"{name}.mcap").write_bytes(chunked(series()))
+    with refused(tmp_path, "several bags.*monday.mcap, tuesday.mcap"):
+        open_source(tmp_path)
 
 
 @pytest.mark.parametrize("kind", bags.KINDS)
@@ -203,8 +254,9 @@ def test_coefficients_filled_up_with_zeros_are_the_same_lens(tmp_path):
 
 def test_an_unknown_lens_model_is_refused(tmp_path):
     path = make(tmp_path, "mcap", [("/front/camera_info", 6, bags.info(6, CAMERA, "warp")), *series()])
-    with pytest.raises(InputError, match="'warp' is not supported"):
-        open_source(path)
+    source = open_source(path)
+    assert source.calibration is None
+    assert "'warp' is not supported" in source.no_calibration
 
 
 def test_parts_of_a_split_bag_follow_each_other(tmp_path):
@@ -244,7 +296,7 @@ def test_after_a_damaged_chunk_the_rest_is_read(tmp_path, good):
     data, path, spoilt = good["mcap"], tmp_path / "flip.mcap", 0
     for at in range(60, len(data) // 2, 7):
         path.write_bytes(data[:at] + bytes([data[at] ^ 0x55]) + data[at + 1 :])
-        items = list(open_source(path, topic=TOPIC).items())
+        items = list(open_source(path, Reading(topic=TOPIC)).items())
         frames = [item for item in items if isinstance(item, Frame)]
         assert len(frames) >= 5
         lost = len(frames) < 6

@@ -11,7 +11,8 @@ from numpy.testing import assert_array_equal
 
 from lumidock.camera import Camera, save_camera
 from lumidock.errors import InputError, LumidockError
-from lumidock.setup.calibration_files import check, read_calibration, write_calibration
+from lumidock.setup.calibration_files import read_calibration, write_calibration
+from lumidock.streams.calibration_check import check
 
 K = np.array([[800.0, 0, 639.5], [0, 801.0, 511.5], [0, 0, 1]])
 CAMERAS = {

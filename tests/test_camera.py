@@ -227,7 +227,7 @@ REFUSALS = {
     "nan focal": (["camera_matrix", "data"], [float("nan"), 0, 360, 0, 600, 288, 0, 0, 1], "finite"),
     "infinite center": (["camera_matrix", "data"], [600, 0, float("inf"), 0, 600, 288, 0, 0, 1], "finite"),
     "unknown key": (["camera_matrix", "dtype"], "d", "dtype: unknown key"),
-    "unknown model": (["distortion_model"], "fov", "distortion_model"),
+    "unknown model": (["distortion_model"], "fov", "distortion model 'fov'"),
     "no coefficients": (["distortion_coefficients"], None, "distortion_coefficients"),
     "three coefficients": (["distortion_coefficients", "data"], [0.1] * 3, "takes 4 or 5 numbers"),
     "nan coefficient": (["distortion_coefficients", "data"], [float("nan")] * 5, "finite"),

@@ -75,7 +75,7 @@ SPOILT = {
     "wrong schema": (edit("station.yaml", "schema: 1", "schema: 2"), "schema"),
     "three layers": (add_layers, "at most two"),
     "station that is no text": (write("station.yaml", bytes(range(256))), "not valid YAML"),
-    "camera that is no camera": (write("camera.yaml", b"a: 1\n"), "camera.yaml: image_width"),
+    "camera that is no camera": (write("camera.yaml", b"a: 1\n"), "camera.yaml: no calibration"),
 }
 WRONG_OPTIONS = [
     ("--station", "cage", "cage: No such file"),

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from lumidock.errors import FrameError
+from lumidock.streams.headers import header_of
 from lumidock.streams.images import read_image
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -108,10 +109,45 @@ def test_every_jpeg_becomes_mono8_or_bgr8(read, content, wanted):
     assert np.abs(image.astype(int) - wanted).mean() < 3
 
 
-def test_the_orientation_tag_does_not_turn_the_picture(read):
-    tag = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
-    turned = JPEG[:2] + b"\xff\xe1" + struct.pack(">H", len(tag) + 2) + tag + JPEG[2:]
-    assert_array_equal(read(turned, "frame.jpg"), read(JPEG, "plain.jpg"))
+def tagged(orientation):
+    """The JPEG with an Exif orientation."""
+    tag = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([orientation]) + b"\0\0\0\0\0\0"
+    return JPEG[:2] + b"\xff\xe1" + struct.pack(">H", len(tag) + 2) + tag + JPEG[2:]
+
+
+@pytest.mark.parametrize("orientation", range(10))
+def test_a_picture_is_turned_as_its_orientation_says(read, tmp_path, orientation):
+    image = read(tagged(orientation), "frame.jpg")
+    wanted = cv2.imread(str(tmp_path / "frame.jpg"))  # OpenCV turns it on its own
+    assert_array_equal(image, wanted)
+    assert header_of(tagged(orientation)).size == image.shape[1::-1]
+    assert_array_equal(read_image(tmp_path / "frame.jpg", as_stored=True), read(JPEG, "plain.jpg"))
+
+
+@pytest.mark.parametrize("suffix", [".tiff", ".bmp", ".webp"])
+@pytest.mark.parametrize("image", [COLOR, GRAY, DEEP_GRAY, DEEP_COLOR], ids=["bgr", "gray", "deep gray", "deep"])
+def test_other_formats_are_read(read, suffix, image):
+    if image.dtype == np.uint16 and suffix != ".tiff":
+        pytest.skip("8 bits only")
+    options = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == ".webp" else []
+    content = encoded(suffix, image, *options)
+    assert_array_equal(read(content, f"a{suffix}"), image)
+    assert header_of(content).size == image.shape[1::-1]
+    for length in range(0, len(content) - 1, 7):
+        with pytest.raises(FrameError):
+            read(content[:length], f"a{suffix}")
+
+
+def test_a_picture_of_another_size_is_refused_by_its_header(tmp_path):
+    import resource
+
+    (tmp_path / "a.png").write_bytes(bomb(9000))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(FrameError, match="9000x9000 pixels, the camera has 32x24"):
+        read_image(tmp_path / "a.png", size=(32, 24))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 14  # KiB
+    (tmp_path / "b.jpg").write_bytes(tagged(6))
+    assert read_image(tmp_path / "b.jpg", size=(24, 32)).shape == (32, 24, 3)
 
 
 def test_a_links_target_is_read(read, tmp_path):
@@ -122,8 +158,11 @@ def test_a_links_target_is_read(read, tmp_path):
 
 REFUSALS = {
     "empty": (b"", "empty file"),
-    "text": (b"not a picture\n", "neither PNG nor JPEG"),
-    "tiff": (encoded(".tiff", COLOR), "neither PNG nor JPEG"),
+    "text": (b"not a picture\n", "neither PNG nor JPEG, TIFF, BMP or WebP"),
+    "gif": (b"GIF89a", "GIF; read are PNG, JPEG, TIFF, BMP and WebP"),
+    "heic": (b"\0\0\0\x18ftypheic", "HEIC; read are PNG, JPEG, TIFF, BMP and WebP"),
+    "video": (b"\0\0\0\x01\x67", "a frame of video (H.264 or H.265); read are PNG, JPEG, TIFF, BMP and WebP"),
+    "float tiff": (encoded(".tiff", GRAY.astype(np.float32)), "TIFF of numbers that are not unsigned integers"),
     "signature alone": (SIGNATURE, "truncated PNG"),
     "png without pixels": (png(4, 4), "cannot be decoded"),
     "png with too few pixels": (png(40, 40, pixels([1, 2, 3])), "cannot be decoded"),
@@ -172,7 +211,21 @@ def test_no_flipped_bit_of_a_png_goes_unseen(read):
             read(PNG[:at] + bytes([PNG[at] ^ 1 << at % 8]) + PNG[at + 1 :])
 
 
-@given(st.sampled_from([b"", SIGNATURE, PNG[:33], b"\xff\xd8", JPEG[:200], JPEG[:-200]]), st.binary(max_size=80))
+STARTS = [
+    b"",
+    SIGNATURE,
+    PNG[:33],
+    b"\xff\xd8",
+    JPEG[:200],
+    JPEG[:-200],
+    b"II*\0\x08\0\0\0",
+    b"BM",
+    b"RIFF\x20\0\0\0WEBPVP8X",
+]
+STARTS += [encoded(suffix, COLOR)[:size] for suffix in (".tiff", ".bmp", ".webp") for size in (40, 160, -3)]
+
+
+@given(st.sampled_from(STARTS), st.binary(max_size=80))
 def test_any_content_gives_a_picture_or_a_bad_frame(tmp_path_factory, start, rest):
     path = tmp_path_factory.getbasetemp() / "any.png"
     path.write_bytes(start + rest + b"\xff\xd9")

@@ -27,6 +27,7 @@ from lumidock.evaluation.metrics import evaluate
 from lumidock.setup.calibration_files import write_calibration
 from lumidock.streams.live import open_live
 from lumidock.streams.mavlink import Mavlink
+from lumidock.streams.source import Reading
 from lumidock.streams.sources import open_source
 from lumidock.streams.vehicle import load_vehicle
 
@@ -126,7 +127,7 @@ def test_rerun_reads_our_mcap_and_verifies_our_rrd(made, tmp_path):
 def test_bags_of_debians_rosbag_are_read(tmp_path, compression):
     path = tmp_path / "debian.bag"
     system_python("rosbag", SCRIPTS / "rosbag1.py", "write", path, compression)
-    source = open_source(path, topic="/cam/image_raw")
+    source = open_source(path, Reading(topic="/cam/image_raw"))
     items = list(source.items())
     assert [item.t_ns for item in items] == [(1_700_000_000 + i) * 10**9 + 250 for i in range(5)]
     for number, item in enumerate(items):

@@ -72,7 +72,7 @@ def run(source, out, *, cold=False, on_fix=lambda _item, _fix: None, calibration
     localizer = PaperLocalizer(station, load_camera(camera_file), cold=cold)
     setup = Setup("paper", cold, Config(), station_file, camera_file)
     with RunFolder(out, station.ids) as folder:
-        return run_source(open_source(source, None), localizer, folder, setup, on_fix=on_fix)
+        return run_source(open_source(source), localizer, folder, setup, on_fix=on_fix)
 
 
 def fixes(out):

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from lumidock.datatypes import Detections, Frame, Unusable
 from lumidock.errors import InputError
 from lumidock.streams.live import open_live
+from lumidock.streams.source import Reading
 from lumidock.streams.sources import open_source
 
 PICTURES = np.random.default_rng(2).integers(0, 256, (4, 6, 8, 3), np.uint8)
@@ -174,7 +175,7 @@ def test_an_image_folder_counts_as_people_do(tmp_path):
     write_pictures(tmp_path / "images", ["img10.png", "img9.png", "img1.PNG", "b.jpg"])
     (tmp_path / "images" / "notes.txt").touch()
     (tmp_path / "images" / "img11.jpeg").write_bytes(b"")
-    items = list(open_source(tmp_path / "images", fps=20.0).items())
+    items = list(open_source(tmp_path / "images", Reading(20.0)).items())
     wanted = [("b", 0, ""), ("img1", 50_000_000, ""), ("img9", 100_000_000, ""), ("img10", 150_000_000, "")]
     assert [told(item) for item in items] == [*wanted, ("img11", 200_000_000, "bad_frame")]
     assert_array_equal([item.image for item in items[1:4]], PICTURES[[2, 1, 0]])
@@ -189,7 +190,7 @@ def test_an_image_folder_needs_a_frame_rate(tmp_path):
 @pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf"), 1e-300, 1e300])
 def test_a_frame_rate_has_limits(tmp_path, fps):
     with pytest.raises(InputError, match="frame rate"):
-        open_source(tmp_path, fps)
+        open_source(tmp_path, Reading(fps))
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.avi", "a.MKV"])
@@ -206,7 +207,11 @@ def test_a_video_has_its_own_stamps(tmp_path, name):
 
 def test_a_frame_rate_overrides_a_videos_stamps(tmp_path):
     write_video(tmp_path / "a.avi")
-    assert [told(item)[1] for item in open_source(tmp_path / "a.avi", fps=3.0).items()][:3] == [0, 333333333, 666666667]
+    assert [told(item)[1] for item in open_source(tmp_path / "a.avi", Reading(3.0)).items()][:3] == [
+        0,
+        333333333,
+        666666667,
+    ]
 
 
 @pytest.mark.parametrize(

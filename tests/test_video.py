@@ -8,6 +8,7 @@ import pytest
 from conftest import refused
 
 from lumidock.datatypes import Frame, Unusable
+from lumidock.streams.source import Reading
 from lumidock.streams.sources import open_source
 
 LEVELS = (20, 60, 100, 140, 180, 220)
@@ -48,7 +49,7 @@ def test_gray_pictures_are_their_luma_in_full_range(tmp_path, pix_fmt):
 def test_color_is_read_unless_it_is_not_needed(tmp_path):
     path = write(tmp_path / "a.mkv", color=(30, 0, 0))
     assert [item.image.shape for item in open_source(path).items()] == [(48, 64, 3)] * 6
-    assert [item.image.shape for item in open_source(path, gray=True).items()] == [(48, 64)] * 6
+    assert [item.image.shape for item in open_source(path, Reading(gray=True)).items()] == [(48, 64)] * 6
 
 
 @pytest.mark.parametrize("codec", ["ffv1", "libx264"])
@@ -87,6 +88,7 @@ import sys
 from pathlib import Path
 sys.modules[sys.argv[1]] = None
 from lumidock.errors import InputError
+from lumidock.streams.source import Reading
 from lumidock.streams.sources import open_source
 try:
     open_source(Path(sys.argv[2]))

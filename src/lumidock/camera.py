@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
@@ -24,6 +24,12 @@ _COEFFICIENTS: dict[str, tuple[int, ...]] = {
     "plumb_bob": (4, 5),
     "rational_polynomial": (8,),
     "equidistant": (4,),
+}
+_MODEL_NAMES: dict[str, tuple[str, ...]] = {
+    "plumb_bob": ("", "plumb_bob", "radtan", "radial_tangential", "brown_conrady", "brown", "opencv"),
+    "rational_polynomial": ("rational_polynomial", "rational", "full_opencv"),
+    "equidistant": ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4", "opencv_fisheye"),
+    "none": ("none", "pinhole", "no_distortion"),
 }
 _MODELS, _MAX_SIDE_PX = ", ".join(_COEFFICIENTS), 32768
 _FOLD_MARGIN, _FOLD_STEPS = 0.999, 10_000
@@ -269,6 +275,7 @@ class _Matrix(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     rows: int = 0
     cols: int = 0
+    dt: str = ""  # that OpenCV writes
     data: list[float]
 
 
@@ -279,8 +286,11 @@ class _CameraInfo(BaseModel):
     image_width: Annotated[int, Field(gt=0, le=_MAX_SIDE_PX)]
     image_height: Annotated[int, Field(gt=0, le=_MAX_SIDE_PX)]
     camera_matrix: _Matrix
-    distortion_model: DistortionModel
+    distortion_model: str | None = None
+    camera_model: str | None = None  # what some writers call it
     distortion_coefficients: _Matrix
+    binning_x: Annotated[int, Field(ge=0)] = 0
+    binning_y: Annotated[int, Field(ge=0)] = 0
 
 
 def load_camera(path: Path) -> Camera:
@@ -288,11 +298,93 @@ def load_camera(path: Path) -> Camera:
 
     Raises: InputError, one line, for what is missing, not finite, of the wrong length or not supported.
     """
-    info = validate(_CameraInfo, read_mapping(path), str(path))
+    return camera_of_mapping(read_mapping(path), path)
+
+
+def camera_of_mapping(content: dict[str, Any], path: Path) -> Camera:
+    """The camera of the content of a ROS camera_info file, which an error calls `path`. Raises: as `load_camera`."""
+    if "lights" in content:
+        raise InputError(f"{path}: a station file, not a camera; it belongs to --station")
+    if "camera_matrix" not in content and "image_width" not in content:
+        raise InputError(
+            f"{path}: not a ROS camera_info file: no image_width and no camera_matrix; `lumidock calib import` turns "
+            "calibrations of other tools into one"
+        )
+    info = validate(_CameraInfo, content, str(path))
+    model = info.distortion_model or info.camera_model or ""
     size = info.image_width, info.image_height
-    return camera_from(
-        str(path), size, info.camera_matrix.data, info.distortion_model, info.distortion_coefficients.data
-    )
+    camera = camera_from(str(path), size, info.camera_matrix.data, model, info.distortion_coefficients.data)
+    binning = max(info.binning_x, 1), max(info.binning_y, 1)
+    return camera if binning == (1, 1) else binned(camera, binning)
+
+
+def binned(camera: Camera, binning: tuple[int, int]) -> Camera:
+    """The camera of pictures whose pixels each stand for `binning` (across, down) of `camera`'s.
+
+    Pixel (0, 0) of both is the centre of its own top-left pixel, so centres move by half a pixel more than ROS's
+    image_geometry has them.
+    """
+    b = np.array(binning, float)
+    K = camera.K.copy()
+    K[[0, 1], [0, 1]] /= b
+    K[:2, 2] = (K[:2, 2] + 0.5) / b - 0.5
+    return replace_matrix(camera, (camera.width // binning[0], camera.height // binning[1]), K)
+
+
+def cropped(camera: Camera, offset: tuple[int, int], size: tuple[int, int]) -> Camera:
+    """The camera of a window of `size` (width, height) px whose first pixel is `offset` (x, y) of `camera`'s."""
+    K = camera.K.copy()
+    K[:2, 2] -= offset
+    return replace_matrix(camera, size, K)
+
+
+def replace_matrix(camera: Camera, size: tuple[int, int], K: Array) -> Camera:
+    """The same lens before another sensor: `size` (width, height) px, `K` (3, 3) px."""
+    return Camera(*size, K, camera.model, camera.distortion)
+
+
+def lens_of(origin: str, model: str, coefficients: list[float]) -> tuple[DistortionModel, list[float]]:
+    """Distortion model and coefficients, as `Camera` has them, of what a calibration calls and lists them.
+
+    Zeros at the end say nothing and are left out; more than five coefficients of `plumb_bob` are those of the rational
+    polynomial, as in OpenCV, and a model without a name is told by their number, as ROS does.
+    Raises: InputError, one line that names `origin`, for a lens that is not supported.
+    """
+    name = model.strip().lower().replace("-", "_").replace(" ", "_")
+    found = next((known for known, names in _MODEL_NAMES.items() if name in names), None)
+    if found is None:
+        raise InputError(f"{origin}: distortion model {model[:40]!r} is not supported; there are {_MODELS}")
+    if not np.isfinite(coefficients).all():
+        raise InputError(f"{origin}: not all numbers are finite")
+    if found == "none":
+        if any(coefficients):
+            raise InputError(f"{origin}: distortion model {model[:40]!r} with coefficients that are not zero")
+        return "plumb_bob", [0.0] * 5
+    if found == "equidistant":
+        return "equidistant", _trimmed(origin, found, coefficients, (4,))
+    if not coefficients:
+        return "plumb_bob", [0.0] * 5
+    most = 8 if any(coefficients[5:]) or (found == "rational_polynomial" and len(coefficients) != 5) else 5
+    if len(coefficients) > 8 and any(coefficients[8:]):
+        what = "tilted sensor (tau_x, tau_y)" if any(coefficients[12:]) else "thin prism (s1 to s4)"
+        raise InputError(
+            f"{origin}: coefficients of a {what}, which is not supported; calibrate without it (OpenCV's flags "
+            "CALIB_THIN_PRISM_MODEL and CALIB_TILTED_MODEL off)"
+        )
+    allowed = (4, 5) if most == 5 else (8,)
+    return "plumb_bob" if most == 5 else "rational_polynomial", _trimmed(origin, found, coefficients, allowed)
+
+
+def _trimmed(origin: str, model: str, coefficients: list[float], allowed: tuple[int, ...]) -> list[float]:
+    """As many coefficients as a model takes; zeros at the end of more are left out."""
+    if len(coefficients) > max(allowed) and not any(coefficients[max(allowed) :]):
+        coefficients = coefficients[: max(allowed)]
+    if len(coefficients) not in allowed:
+        wanted = " or ".join(map(str, _COEFFICIENTS[model]))
+        raise InputError(
+            f"{origin}: distortion_coefficients: {model} takes {wanted} numbers, there are {len(coefficients)}"
+        )
+    return coefficients
 
 
 def camera_from(origin: str, size: tuple[int, int], matrix: list[float], model: str, distortion: list[float]) -> Camera:
@@ -300,21 +392,21 @@ def camera_from(origin: str, size: tuple[int, int], matrix: list[float], model: 
 
     Raises: InputError, one line that names `origin`, for what is not finite, of the wrong length or not supported.
     """
-    if model not in _COEFFICIENTS:
-        raise InputError(f"{origin}: distortion model {model[:40]!r} is not supported; there are {_MODELS}")
     if not all(0 < side <= _MAX_SIDE_PX for side in size):
         raise InputError(f"{origin}: an image of {size[0]}x{size[1]} pixels")
     if len(matrix) != 9:
-        raise InputError(f"{origin}: camera_matrix: wanted 9 numbers")
+        raise InputError(f"{origin}: camera_matrix: wanted 9 numbers, there are {len(matrix)}")
     K = np.array(matrix).reshape(3, 3)
-    if not (np.isfinite(K).all() and np.isfinite(distortion).all()):
+    if not np.isfinite(K).all():
         raise InputError(f"{origin}: not all numbers are finite")
-    if K[0, 0] <= 0 or K[1, 1] <= 0 or K[0, 1] != 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
+    if K[0, 1] != 0:
+        raise InputError(
+            f"{origin}: camera_matrix: a skew of {K[0, 1]:g} px; calibrate without, only positive fx and fy are read"
+        )
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
         raise InputError(f"{origin}: camera_matrix: wanted [fx, 0, cx, 0, fy, cy, 0, 0, 1] with positive fx and fy")
-    if len(distortion) not in _COEFFICIENTS[model]:
-        wanted = " or ".join(map(str, _COEFFICIENTS[model]))
-        raise InputError(f"{origin}: distortion_coefficients: {model} takes {wanted} numbers")
-    camera = Camera(*size, K, cast("DistortionModel", model), np.array(distortion))
+    lens, coefficients = lens_of(origin, model, distortion)
+    camera = Camera(*size, K, lens, np.array(coefficients))
     if camera._fold == 0.0:
         raise InputError(f"{origin}: distortion_coefficients: no lens bends light like this")
     return camera

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,6 +13,13 @@ from lumidock.errors import InputError
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 20
+
+_KINDS = {
+    "station": ("lights", "docking_point"),
+    "vehicle": ("T_body_cam",),
+    "camera": ("camera_matrix", "image_width", "cam0"),
+    "config": ("detect", "integrity"),
+}
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -59,11 +67,23 @@ def read_text(path: Path) -> str:
             content_bytes = file.read(MAX_BYTES + 1)  # not the size on disk: a device or a pipe has none
         if len(content_bytes) > MAX_BYTES:
             raise InputError(f"{path}: larger than {MAX_BYTES} bytes")
-        return content_bytes.decode("utf-8")
+        return _decoded(content_bytes)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
     except ValueError as error:  # no UTF-8, or a name that no file can have
         raise InputError(f"{path}: not valid YAML: {error}") from None
+
+
+def _decoded(content: bytes) -> str:
+    """Text by its byte order mark, which editors on Windows write; UTF-8 without one. Raises: ValueError."""
+    for mark, encoding in (
+        (codecs.BOM_UTF8, "utf-8"),
+        (codecs.BOM_UTF16_LE, "utf-16-le"),
+        (codecs.BOM_UTF16_BE, "utf-16-be"),
+    ):
+        if content.startswith(mark):
+            return content[len(mark) :].decode(encoding)
+    return content.decode("utf-8")
 
 
 def parse_mapping(text: str, path: Path) -> dict[str, Any]:
@@ -92,3 +112,15 @@ def validate(model: type[Model], content: dict[str, Any], origin: str) -> Model:
         if first["type"] == "extra_forbidden":
             message = "unknown key"
         raise InputError(f"{origin}: {place + ': ' if place else ''}{message}") from None
+
+
+def kind_of_file(path: Path) -> str:
+    """What a YAML file plainly is by its keys: station, camera, vehicle or config; empty where it is none of them."""
+    try:
+        content = read_mapping(path)
+    except InputError:
+        return ""
+    for kind, keys in _KINDS.items():
+        if any(key in content for key in keys):
+            return kind
+    return ""

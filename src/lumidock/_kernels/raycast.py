@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lumidock._kernels import inlined, inner
+from lumidock._kernels.compiling import part
 from lumidock.datatypes import Array, Indices
 
 BOX, FRUSTUM, RING, ELLIPSOID = range(4)
@@ -36,7 +36,7 @@ class Solids(NamedTuple):
     surface: Indices
 
 
-@inlined
+@part
 def _slabs(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, size: Array) -> tuple[float, int]:
     enter, leave, face, exit_face = -1e30, 1e30, 0, 0
     for axis in range(3):
@@ -58,7 +58,7 @@ def _slabs(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, siz
     return (enter, face) if enter > _CLEAR_M else (leave, exit_face)
 
 
-@inlined
+@part
 def _frustum(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, size: Array) -> float:
     slope = size[2]
     radius, change = size[0] + slope * oz, slope * dz
@@ -81,7 +81,7 @@ def _frustum(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, s
     return -1.0
 
 
-@inlined
+@part
 def _ring(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, size: Array) -> float:
     if abs(dz) < _PARALLEL:
         return -1.0
@@ -91,7 +91,7 @@ def _ring(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, size
     return t if t > _CLEAR_M and size[0] * size[0] <= r2 <= size[1] * size[1] else -1.0
 
 
-@inlined
+@part
 def _ellipsoid(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, size: Array) -> float:
     ox, oy, oz, dx, dy, dz = ox / size[0], oy / size[1], oz / size[2], dx / size[0], dy / size[1], dz / size[2]
     a, b = dx * dx + dy * dy + dz * dz, ox * dx + oy * dy + oz * dz
@@ -104,7 +104,7 @@ def _ellipsoid(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float,
     return (-b + root) / a if -b + root > _CLEAR_M * a else -1.0
 
 
-@inner
+@part
 def hit(solids: Solids, s: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> tuple[float, int]:
     """Length m along the ray to the first point on solid `s`, negative without one, and which face of a box it is."""
     R, c, size = solids.R_world_local[s], solids.center[s], solids.size[s]
@@ -125,7 +125,7 @@ def hit(solids: Solids, s: int, ox: float, oy: float, oz: float, dx: float, dy: 
     return _ellipsoid(lx, ly, lz, ex, ey, ez, size), 0
 
 
-@inlined
+@part
 def to_local(solids: Solids, s: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """A point of the world in the frame of solid `s`."""
     R, c = solids.R_world_local[s], solids.center[s]
@@ -137,7 +137,7 @@ def to_local(solids: Solids, s: int, x: float, y: float, z: float) -> tuple[floa
     )
 
 
-@inner
+@part
 def normal(solids: Solids, s: int, face: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Unit normal, on either side, of solid `s` at a point of its surface."""
     R, size = solids.R_world_local[s], solids.size[s]
@@ -161,7 +161,7 @@ def normal(solids: Solids, s: int, face: int, x: float, y: float, z: float) -> t
     )
 
 
-@inner
+@part
 def between(
     solids: Solids, some: Indices, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, length: float
 ) -> bool:
@@ -180,7 +180,7 @@ def between(
     return False
 
 
-@inner
+@part
 def may_hit(
     solids: Solids, s: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, half_angle: float
 ) -> bool:
@@ -204,7 +204,7 @@ def may_hit(
     return _axis_apart(solids, s, cx, cy, cz, dx, dy, dz) <= _widest(solids.size[s]) + reach
 
 
-@inlined
+@part
 def _near_box(
     solids: Solids, s: int, cx: float, cy: float, cz: float, dx: float, dy: float, dz: float, grown: float
 ) -> bool:
@@ -224,12 +224,12 @@ def _near_box(
     return enter <= leave
 
 
-@inlined
+@part
 def _widest(size: Array) -> float:
     return size[0] + abs(size[2]) * size[1]
 
 
-@inlined
+@part
 def _axis_apart(solids: Solids, s: int, cx: float, cy: float, cz: float, dx: float, dy: float, dz: float) -> float:
     """Distance m between a ray and the axis of a frustum, whose center lies at (cx, cy, cz) from its start."""
     R, half = solids.R_world_local[s], solids.size[s, 1]
@@ -250,7 +250,7 @@ CELLS = 6 * SIDE * SIDE
 CELL_RAD = 0.5 * math.sqrt(2.0) * 2.0 / SIDE  # half the diagonal of the cell in the middle of a side, the largest one
 
 
-@inner
+@part
 def cell_of(dx: float, dy: float, dz: float) -> int:
     """Which cell of a cube around a point a direction goes through."""
     ax, ay, az = abs(dx), abs(dy), abs(dz)
@@ -264,7 +264,7 @@ def cell_of(dx: float, dy: float, dz: float) -> int:
     return (side * SIDE + row) * SIDE + column
 
 
-@inner
+@part
 def _middle_of(cell: int) -> tuple[float, float, float]:
     side, row, column = cell // (SIDE * SIDE), cell // SIDE % SIDE, cell % SIDE
     a, b = (row + 0.5) * 2.0 / SIDE - 1.0, (column + 0.5) * 2.0 / SIDE - 1.0
@@ -277,7 +277,7 @@ def _middle_of(cell: int) -> tuple[float, float, float]:
     return a * scale, b * scale, sign * scale
 
 
-@inner
+@part
 def list_blockers(solids: Solids, p: Array, blockers: NDArray[np.int16]) -> None:
     """For each cell around each point `p` (L, 3), in `blockers` (L, CELLS, S + 1), how many solids it shows and which.
 

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lumidock._kernels import inner
-from lumidock._kernels.compiling import entry
+from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.raycast import BOX, CELLS, FAR_M, RING, Solids, between, hit, list_blockers, may_hit
 from lumidock._kernels.shading import (
     BANDS,
@@ -76,7 +75,7 @@ class Picture(NamedTuple):
     cells: NDArray[np.float32]
 
 
-@inner
+@part
 def _aim(sight: Sight, row: int, column: int, own: Scratch) -> None:
     """Rays and etendue of a block's samples, between those of its corners."""
     rays, step = sight.rays, 1.0 / BLOCK
@@ -97,7 +96,7 @@ def _aim(sight: Sight, row: int, column: int, own: Scratch) -> None:
             own.etendue[i, j] = e + to_e * j
 
 
-@inner
+@part
 def _cast(solids: Solids, spread: float, own: Scratch) -> None:
     """The first hit of every sample of a block."""
     count, middle = 0, own.rays[BLOCK // 2, BLOCK // 2]
@@ -117,7 +116,7 @@ def _cast(solids: Solids, spread: float, own: Scratch) -> None:
             own.far[i, j], own.what[i, j] = near, what
 
 
-@inner
+@part
 def _shade(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, i: int, j: int) -> None:
     """The light of one sample."""
     what, t = own.what[i, j], own.far[i, j]
@@ -131,7 +130,7 @@ def _shade(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, 
     through_water(world.medium, dx, dy, dz, t, u, v, own.light, i, j)
 
 
-@inner
+@part
 def _uniform(own: Scratch, top: int, left: int, side: int) -> bool:
     what = own.what[top, left]
     for i in range(top, top + side):
@@ -141,7 +140,7 @@ def _uniform(own: Scratch, top: int, left: int, side: int) -> bool:
     return True
 
 
-@inner
+@part
 def _blended(own: Scratch, top: int, left: int, side: int, i: int, j: int, band: int) -> float:
     last = side - 1
     fv, fu, light = (i - top) / last, (j - left) / last, own.light
@@ -150,7 +149,7 @@ def _blended(own: Scratch, top: int, left: int, side: int, i: int, j: int, band:
     return high * (1.0 - fv) + low * fv
 
 
-@inner
+@part
 def _smooth(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, part: tuple[int, int, int]) -> bool:
     """Whether the light in the middle of a part is what its corners say."""
     top, left, side = part
@@ -169,7 +168,7 @@ def _smooth(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch,
     return True
 
 
-@inner
+@part
 def _fill(own: Scratch, top: int, left: int, side: int) -> None:
     last = side - 1
     for band in range(PARTS):
@@ -183,18 +182,18 @@ def _fill(own: Scratch, top: int, left: int, side: int) -> None:
                 own.light[top + i, left + j, band] = value + step * j
 
 
-@inner
+@part
 def _flat(solids: Solids, what: int) -> bool:
     return what < 0 or solids.kind[what >> 2] == BOX or solids.kind[what >> 2] == RING
 
 
-@inner
+@part
 def _shiny(world: RunDraws, what: int) -> bool:
     k = world.solids.surface[what >> 2]
     return world.surfaces.gloss[k] > 0.0 and world.surfaces.shininess[k] > _SHARP
 
 
-@inner
+@part
 def _shade_edge(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, top: int, left: int) -> None:
     """The light of a small part that shows several surfaces; all samples of a flat one get that of its first."""
     for i in range(top, top + _FINE):
@@ -212,7 +211,7 @@ def _shade_edge(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scra
                 own.light[i, j, band] = own.light[top + found // _FINE, left + found % _FINE, band]
 
 
-@inner
+@part
 def _near_lamp(world: RunDraws, own: Scratch, top: int, left: int, side: int) -> bool:
     """Whether a lamp is within twice a part's diagonal of its middle, so that its peak could be missed."""
     last = side - 1
@@ -231,7 +230,7 @@ def _near_lamp(world: RunDraws, own: Scratch, top: int, left: int, side: int) ->
     return False
 
 
-@inner
+@part
 def _shade_block(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch) -> None:
     """The light of every sample, from the corners of the largest parts in which it changes evenly."""
     own.stack[0, 0], own.stack[0, 1], own.stack[0, 2] = 0, 0, BLOCK
@@ -263,7 +262,7 @@ def _shade_block(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scr
                 waiting += 1
 
 
-@inner
+@part
 def _expose(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, picture: Picture) -> None:
     """Write a block's electrons and ranges into the picture."""
     surfaces, gain, cells = world.surfaces, sight.gain, picture.cells

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lumidock._kernels import inner
+from lumidock._kernels.compiling import part
 from lumidock._kernels.raycast import BOX, Solids, between, cell_of, normal, to_local
 from lumidock.datatypes import Array, Indices
 
@@ -96,7 +96,7 @@ class RunDraws(NamedTuple):
     noise: Array
 
 
-@inner
+@part
 def lobe(shininess: float, cosine: float) -> float:
     """Normalised Blinn-Phong: reflected over incident light 1/sr, of a lobe that reflects all of what comes head-on.
 
@@ -107,14 +107,14 @@ def lobe(shininess: float, cosine: float) -> float:
     return scale * max(cosine, 0.0) ** n
 
 
-@inner
+@part
 def daylight(medium: Medium, band: int, height_m: float, cosine: float) -> float:
     """Irradiance W/m2 of a surface `height_m` above the camera, whose normal has this `cosine` to the vertical."""
     down = medium.surface[band] * math.exp(-medium.decay[band] * max(medium.depth_m - height_m, 0.0))
     return down * (_SIDE + ((1.0 - _SIDE) if cosine > 0.0 else (_SIDE - _BELOW)) * cosine)
 
 
-@inner
+@part
 def reflected(
     world: RunDraws, s: int, face: int, dx: float, dy: float, dz: float, t: float, out: Array, i: int, j: int
 ) -> None:
@@ -170,7 +170,7 @@ def reflected(
                 out[i, j, GLOSSY + band] += light * bright
 
 
-@inner
+@part
 def through_water(
     medium: Medium, dx: float, dy: float, dz: float, t: float, u: float, v: float, out: Array, i: int, j: int
 ) -> None:
@@ -198,7 +198,7 @@ def through_water(
         _add_lamp(medium, t, u, v, out, i, j)
 
 
-@inner
+@part
 def _add_lamp(medium: Medium, t: float, u: float, v: float, out: Array, i: int, j: int) -> None:
     """Add the scattered light of the vehicle's lamp, linear in range and across the grid."""
     edges, lamp_sr = medium.edge_m, medium.lamp_sr
@@ -220,7 +220,7 @@ def _add_lamp(medium: Medium, t: float, u: float, v: float, out: Array, i: int, 
         out[i, j, WATER + band] += total
 
 
-@inner
+@part
 def _stains(noise: Array, x: float, y: float) -> float:
     """Smooth noise in [-1, 1]: random values at integers, blended. Source: K. Perlin, SIGGRAPH 1985."""
     ix, iy = math.floor(x), math.floor(y)
@@ -233,7 +233,7 @@ def _stains(noise: Array, x: float, y: float) -> float:
     return top * (1.0 - fy) + low * fy
 
 
-@inner
+@part
 def paint(world: RunDraws, s: int, face: int, x: float, y: float, z: float, footprint_m: float) -> tuple[float, float]:
     """Share of the pattern's other part at a point of solid `s`, and the factor by which stains change the albedo.
 
@@ -271,7 +271,7 @@ def paint(world: RunDraws, s: int, face: int, x: float, y: float, z: float, foot
     return other, factor
 
 
-@inner
+@part
 def _line(place: float, period: float, share: float, footprint: float) -> float:
     """How much of a `footprint` around a place is in the lines of a grating, whose lines start at whole periods."""
     if footprint >= period:

@@ -15,7 +15,7 @@ from lumidock.datatypes import Fix, Frame, Image
 from lumidock.picture import developed
 from lumidock.station import Station
 from lumidock.streams.overlay import around_lights, draw, whole
-from lumidock.streams.sources import Item
+from lumidock.streams.source import Item
 
 _WIDTH = 1224
 _PICTURE_OF_STAGE = {"search": 1, "front": 50, "transition": 60, "rear": 20}  # which fix of a stage the sheet shows

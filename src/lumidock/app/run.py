@@ -18,7 +18,7 @@ from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import FrameError, InputError
 from lumidock.methods import Method
 from lumidock.streams.run_folder import RunFolder, identities
-from lumidock.streams.sources import Item, Source
+from lumidock.streams.source import Item, Source
 
 
 @dataclass(slots=True)
@@ -91,8 +91,11 @@ def run(
     setup: Setup,
     *,
     on_fix: Callable[[Item, Fix], None] = lambda _item, _fix: None,
+    size: tuple[int, int] | None = None,
 ) -> Summary:
     """Process all of a source and describe the run, also when it is interrupted.
+
+    Pictures that are not of `size` (width, height) px are bad frames whose pixels stay unread.
 
     Raises: InputError when not one row could be used.
     """
@@ -100,7 +103,7 @@ def run(
     folder.describe(identity | {"counts": summary.as_dict()})
     stage: Stage = "search"
     try:
-        for item in source.items():
+        for item in source.items(size):
             fix, latency_us, error = process(localizer, item, "search" if setup.cold else stage)
             stage = fix.stage
             folder.add(fix, latency_us, t_ns=item.t_ns)

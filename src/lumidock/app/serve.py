@@ -21,7 +21,7 @@ from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import LumidockError
 from lumidock.methods import Method
 from lumidock.streams.sinks import Sink
-from lumidock.streams.sources import Item
+from lumidock.streams.source import Item
 
 _RECENT = 1000  # frames that rates and latencies are taken over
 _TICK_S = 0.2  # between looks at a sink that has nothing to do

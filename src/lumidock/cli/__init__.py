@@ -14,7 +14,7 @@ from typing import Annotated, NoReturn
 import cv2
 import typer
 
-from lumidock.camera import load_camera, save_camera
+from lumidock.camera import load_camera
 from lumidock.cli import calibration, doctoring, evaluation, exporting, inspection, reporting, serving, stations
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
@@ -22,17 +22,22 @@ from lumidock.cli.shared import (
     SCENARIOS,
     SIM,
     AsJson,
+    AsStored,
     Bits,
+    CameraName,
     CameraOption,
     ConfigOption,
+    DelayMs,
     Force,
     Fps,
+    InfoTopic,
     Method,
     Out,
     Seed,
     SourceArgument,
     StationOption,
     Topic,
+    Trusted,
     Workers,
     app,
     calibration_of,
@@ -40,6 +45,7 @@ from lumidock.cli.shared import (
     example,
     file_of,
     interrupts_held,
+    keep_camera,
     open_any,
     prepare_folder,
     prepare_sequence,
@@ -47,6 +53,7 @@ from lumidock.cli.shared import (
     require_folder,
     shipped_or_path,
     simulated,
+    tell,
     warn_if_nothing_is_kept,
 )
 from lumidock.config import Config, load_config
@@ -54,7 +61,8 @@ from lumidock.datatypes import Fix
 from lumidock.errors import InputError, LumidockError
 from lumidock.methods import METHODS, localizer_of, require_method
 from lumidock.station import load_station
-from lumidock.streams.sources import Item, open_source
+from lumidock.streams.source import Item, Reading
+from lumidock.streams.sources import open_source
 
 _MAX_SEED = 10**9
 _COMMANDS = (
@@ -142,8 +150,13 @@ def _run(
     method: Method = "lumidock",
     cold: Annotated[bool, typer.Option("--cold", help="Forget all history before each frame.")] = False,
     topic: Topic = None,
+    info_topic: InfoTopic = None,
     bits: Bits = 16,
     fps: Fps = None,
+    as_stored: AsStored = False,
+    delay_ms: DelayMs = 0.0,
+    camera_name: CameraName = None,
+    trust_calibration: Trusted = False,
     config: ConfigOption = None,
     force: Force = False,
     as_json: AsJson = False,
@@ -158,31 +171,32 @@ def _run(
     if source.startswith(SIM):
         require_folder(out, force)
         source, force = str(simulated(source, out / "sequence", station, camera)), True
-    opened = open_any(source, fps, topic=topic, bits=bits, station=station)
+    reading = Reading(
+        fps, topic, info_topic, bits, as_stored=as_stored, trusted=trust_calibration, follow_calibration=camera is None
+    )
+    opened = open_any(source, reading, delay_ms=delay_ms, station=station)
     station_file = file_of("station", station, opened.station, opened)
-    described = camera is None and opened.camera is None and opened.calibration is not None
-    camera_file = out / "camera.yaml" if described else file_of("camera", camera, opened.camera, opened)
     dock = load_station(station_file)
-    lens = calibration_of(camera, opened)
+    calibration = calibration_of(camera, opened, name=camera_name, trusted=trust_calibration)
+    lens = calibration.camera
+    tell((*opened.notes, *calibration.warnings))
     warn_if_nothing_is_kept()
     localizer = localizer_of(method, dock, lens, settings, cold=cold)
     if out.is_dir() and opened.path.is_dir() and out.samefile(opened.path):
         raise InputError(f"{out}: is the source; write the run elsewhere")
     prepare_folder(out, force)
-    if described:
-        camera_file.unlink(missing_ok=True)  # a link, not what it points to
-        save_camera(lens, camera_file)
-    setup = Setup(method, cold, settings, station_file, camera_file)
     with RunFolder(out, dock.ids) as folder, progress_bar("run") as progress, interrupts_held() as let_interrupt:
         copy(station_file, out / "station.yaml")
-        copy(camera_file, out / "camera.yaml")
+        camera_file = keep_camera(calibration, out / "camera.yaml")
+        setup = Setup(method, cold, settings, station_file, camera_file)
         done = count(1)
 
         def on_fix(_item: Item, _fix: Fix) -> None:
             progress(next(done), opened.count)
             let_interrupt()
 
-        summary = run_source(opened, localizer, folder, setup, on_fix=on_fix)
+        size = lens.width, lens.height
+        summary = run_source(opened, localizer, folder, setup, on_fix=on_fix, size=size)
     counts = summary.as_dict()
     if as_json:
         print(json.dumps(counts, indent=2))

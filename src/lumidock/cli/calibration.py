@@ -11,21 +11,24 @@ from typing import Annotated
 import typer
 
 from lumidock.camera import Camera, load_camera
-from lumidock.cli.shared import AsJson, Force, app, example, open_any, require_new, shipped_or_path
+from lumidock.cli.shared import AsJson, Force, app, example, file_given, open_any, require_new
 from lumidock.datatypes import Frame
 from lumidock.errors import InputError
+from lumidock.streams.source import Reading
 
 calib = typer.Typer(help="Read, write and check camera calibrations.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(calib, name="calib")
+
+_ANY_FPS = 1.0  # times do not matter here
 
 Size = Annotated[str | None, typer.Option("--size", metavar="WxH", help="Image size that it has to be for.")]
 
 
 @calib.command("import", epilog=example("lumidock calib import camchain.yaml camera.yaml --name cam1"))
 def _import(
-    source: Annotated[Path, typer.Argument(metavar="FILE", help="ROS camera_info, Kalibr camchain or OpenCV file.")],
+    source: Annotated[Path, typer.Argument(metavar="FILE", help="Calibration file of any tool that is read.")],
     target: Annotated[Path, typer.Argument(metavar="CAMERA", help="camera_info file to write.")],
-    name: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera of a camchain.")] = None,
+    name: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera of a file of several.")] = None,
     size: Size = None,
     force: Force = False,
 ) -> None:
@@ -48,7 +51,7 @@ def _export(
     """Turn a camera_info file into another tool's."""
     from lumidock.setup.calibration_files import write_calibration
 
-    camera = load_camera(shipped_or_path("camera", source))
+    camera = load_camera(file_given("camera", source))
     require_new(target, force)
     write_calibration(camera, target, form)
     print(f"written to {target}")
@@ -63,7 +66,7 @@ def _export(
 )
 def _check(
     source: Annotated[str, typer.Argument(metavar="CAMERA", help="Calibration of any kind, or a shipped name.")],
-    name: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera of a camchain.")] = None,
+    name: Annotated[str | None, typer.Option(metavar="NAME", help="Which camera of a file of several.")] = None,
     size: Size = None,
     frames: Annotated[
         str | None, typer.Option("--source", metavar="SOURCE", help="Frames whose size it has to be for.")
@@ -73,11 +76,12 @@ def _check(
     as_json: AsJson = False,
 ) -> None:
     """Show the field of view, and warn of what looks wrong."""
-    from lumidock.setup.calibration_files import check, read_calibration
+    from lumidock.setup.calibration_files import read_calibration
+    from lumidock.streams.calibration_check import check
 
     if (lens_mm is None) != (pixel_um is None):
         raise InputError("--lens-mm and --pixel-um belong together")
-    camera = read_calibration(shipped_or_path("camera", source), name=name, size=_size(size))
+    camera = read_calibration(file_given("camera", source), name=name, size=_size(size))
     if frames is not None:
         _require_size_of(frames, camera, source)
     verdict = check(camera, lens_mm=lens_mm, pixel_um=pixel_um)
@@ -88,6 +92,8 @@ def _check(
     print(f"size        {camera.width} x {camera.height}, {camera.model}")
     print(f"focal       {camera.focal_px[0]:.1f}, {camera.focal_px[1]:.1f} px")
     print(f"field       {across:.1f} x {down:.1f} degrees, {diagonal:.1f} across the corners")
+    if verdict.impossible:
+        print(f"IMPOSSIBLE  {verdict.impossible}; only --trust-calibration makes `run` and `serve` take it")
     for warning in verdict.warnings:
         print(f"WARNING     {warning}")
 
@@ -103,7 +109,9 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 def _require_size_of(frames: str, camera: Camera, source: str) -> None:
     """Raises: InputError when the first frame that can be read is of another size."""
-    for item in open_any(frames, None if not Path(frames).is_dir() else 1.0).items():
+    for item in open_any(
+        frames, Reading(fps=_ANY_FPS if Path(frames).is_dir() else None, follow_calibration=False)
+    ).items():
         if isinstance(item, Frame):
             height, width = item.image.shape[:2]
             if (width, height) != (camera.width, camera.height):

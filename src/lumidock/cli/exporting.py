@@ -18,6 +18,7 @@ from lumidock.cli.shared import (
     progress_bar,
     require_new,
 )
+from lumidock.streams.source import Reading
 from lumidock.streams.sources import open_source
 from lumidock.streams.vehicle import load_vehicle
 
@@ -46,7 +47,7 @@ def _export(
     from lumidock.streams.export import export
 
     require_new(target, force)
-    opened = open_source(source, fps, topic=topic) if source else None
+    opened = open_source(source, Reading(fps, topic)) if source else None
     mounting = load_vehicle(vehicle) if vehicle else None
     with interrupts_held() as let_interrupt, progress_bar("export") as progress:
 

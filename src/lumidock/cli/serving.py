@@ -20,14 +20,19 @@ from lumidock.app.warm import warm_up
 from lumidock.camera import save_camera
 from lumidock.cli.shared import (
     SIM,
+    AsStored,
     Bits,
+    CameraName,
     CameraOption,
     ConfigOption,
+    DelayMs,
     Force,
     Fps,
+    InfoTopic,
     Method,
     StationOption,
     Topic,
+    Trusted,
     VehicleOption,
     app,
     calibration_of,
@@ -38,6 +43,7 @@ from lumidock.cli.shared import (
     prepare_folder,
     require_new,
     simulated,
+    tell,
     warn_if_nothing_is_kept,
 )
 from lumidock.config import Config, load_config
@@ -46,6 +52,7 @@ from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
 from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Scene, open_rerun
+from lumidock.streams.source import Reading
 from lumidock.streams.vehicle import load_vehicle
 
 _LOOPBACK, _ENDPOINT = "127.0.0.1", re.compile(r"(tcp|udp|tls|quic)/[^/?#]+:[0-9]{1,5}")
@@ -98,8 +105,13 @@ def _serve(
     vehicle: VehicleOption = None,
     method: Method = "lumidock",
     topic: Topic = None,
+    info_topic: InfoTopic = None,
     bits: Bits = 16,
     fps: Fps = None,
+    as_stored: AsStored = False,
+    delay_ms: DelayMs = 0.0,
+    camera_name: CameraName = None,
+    trust_calibration: Trusted = False,
     config: ConfigOption = None,
     loop: Annotated[bool, typer.Option("--loop", help="Show a recording again and again.")] = False,
     mavlink: MavlinkOption = None,
@@ -123,10 +135,21 @@ def _serve(
         if source.startswith(SIM):
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             source = str(simulated(source, folder / "sequence", station, camera))
-        opened = open_any(source, fps, topic=topic, bits=bits, station=station)
+        reading = Reading(
+            fps,
+            topic,
+            info_topic,
+            bits,
+            as_stored=as_stored,
+            trusted=trust_calibration,
+            follow_calibration=camera is None,
+        )
+        opened = open_any(source, reading, delay_ms=delay_ms, station=station)
         station_file = file_of("station", station, opened.station, opened)
         dock = load_station(station_file)
-        lens = calibration_of(camera, opened)
+        calibration = calibration_of(camera, opened, name=camera_name, trusted=trust_calibration)
+        lens = calibration.camera
+        tell((*opened.notes, *calibration.warnings))
         scene = Scene(dock, lens, mounting)
         warn_if_nothing_is_kept()
         list(warm_up(localizer_of(method, dock, lens, settings).process, dock, lens))
@@ -134,14 +157,17 @@ def _serve(
         sinks = [
             *_vehicle_sinks(scene, mavlink, zenoh, domain if dds else None, domain, host),
             *_viewer_sinks(scene, foxglove_port if foxglove else None, rerun, host),
-            *_file_sinks(scene, station_file, out, record or [], force),
         ]
         sys.setswitchinterval(_SWITCH_S)
         stop, newest = threading.Event(), Newest()
-        reader = Camera(opened.items, newest, live=opened.live, loop=loop, stop=stop)
+        reader = Camera(
+            partial(opened.items, (lens.width, lens.height)), newest, live=opened.live, loop=loop, stop=stop
+        )
         server = Server(localizer, reader, newest, sinks, stop)
         page = _health_page(host, health_port, server)
         stack.callback(page.close)
+        # last of all, so that a start that fails leaves what is on the disk alone
+        sinks += _file_sinks(scene, station_file, out, record or [], force)
         print(f"health at http://{host}:{page.port}/", flush=True)
         with _stopped_by_signals(stop):
             server.serve()
@@ -213,6 +239,10 @@ def _viewer_sinks(scene: Scene, foxglove_port: int | None, rerun: str | None, ho
 
 
 def _file_sinks(scene: Scene, station_file: Path, out: Path | None, record: list[Path], force: bool) -> list[Worker]:
+    for path in record:
+        if path.suffix not in FILE_KINDS:
+            raise InputError(f"--record {path}: not one of {', '.join(FILE_KINDS)}")
+        require_new(path, force)
     workers = []
     if out is not None:
         prepare_folder(out, force)
@@ -220,11 +250,7 @@ def _file_sinks(scene: Scene, station_file: Path, out: Path | None, record: list
         copy(station_file, out / "station.yaml")
         save_camera(scene.camera, out / "camera.yaml")
         workers.append(Worker(out.name, lambda: folder, queue=_ROWS, pictures=False))
-    for path in record:
-        if path.suffix not in FILE_KINDS:
-            raise InputError(f"--record {path}: not one of {', '.join(FILE_KINDS)}")
-        require_new(path, force)
-        workers.append(Worker(path.name, Numbered(path, scene).open, queue=_LONG, patient=True))
+    workers += [Worker(path.name, Numbered(path, scene).open, queue=_LONG, patient=True) for path in record]
     return workers
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from types import FrameType
@@ -23,14 +24,17 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from lumidock.camera import Camera, load_camera
+from lumidock.camera import Camera, load_camera, save_camera
 from lumidock.errors import InputError
 from lumidock.station import load_station
 from lumidock.streams.live import open_live
-from lumidock.streams.sources import Source, open_source
+from lumidock.streams.source import Reading, Source, delayed
+from lumidock.streams.sources import open_source
+from lumidock.yamlfile import kind_of_file
 
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
+_MAX_DELAY_MS = 10_000.0  # no camera on a vehicle is later
 SIM = "sim:"
 DEFAULT_STATION, DEFAULT_CAMERA = "cage-2x2x5", "imx264-60deg"
 _SIMULATED = (
@@ -54,7 +58,8 @@ StationOption = Annotated[
     str | None, typer.Option("--station", metavar="FILE", help="Station file, or the name of a shipped one.")
 ]
 CameraOption = Annotated[
-    str | None, typer.Option("--camera", metavar="FILE", help="camera_info file, or the name of a shipped one.")
+    str | None,
+    typer.Option("--camera", metavar="FILE", help="Calibration file of any kind, or the name of a shipped one."),
 ]
 VehicleOption = Annotated[
     Path | None, typer.Option("--vehicle", metavar="FILE", help="Vehicle file: frame names and the camera's mounting.")
@@ -76,8 +81,25 @@ Bits = Annotated[
         "--bits", metavar="N", min=8, max=16, help="How many bits of 16-bit pixels count: 12 of a 12-bit camera."
     ),
 ]
+InfoTopic = Annotated[
+    str | None, typer.Option("--info-topic", metavar="NAME", help="The CameraInfo of a bag where several could be it.")
+]
+AsStored = Annotated[
+    bool, typer.Option("--as-stored", help="Do not turn pictures that EXIF or a video's header says to turn.")
+]
+Trusted = Annotated[bool, typer.Option("--trust-calibration", help="Accept a calibration that looks like no camera's.")]
+DelayMs = Annotated[
+    float,
+    typer.Option("--delay-ms", metavar="MS", help="What passes between exposure and stamp; taken off every stamp."),
+]
+CameraName = Annotated[
+    str | None, typer.Option("--camera-name", metavar="NAME", help="Which camera of a calibration file of several.")
+]
 Fps = Annotated[
-    float | None, typer.Option("--fps", metavar="F", help="Frames per second, for sources without time stamps.")
+    float | None,
+    typer.Option(
+        "--fps", metavar="F", help="Frames per second, for sources without stamps; replaces a video's own times."
+    ),
 ]
 Workers = Annotated[int | None, typer.Option("--workers", metavar="N", min=1, help="Processes; by default one a core.")]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from it.")]
@@ -95,10 +117,24 @@ def warn_if_nothing_is_kept() -> None:
 def file_of(kind: str, given: str | None, beside: Path | None, source: Source) -> Path:
     """The station or camera file: the option, or the one beside the frames."""
     if given is not None:
-        return shipped_or_path(kind, given)
+        return file_given(kind, given)
     if beside is None:
         raise InputError(f"{source.path}: no {kind}.yaml beside the frames; give --{kind} FILE")
+    _require_kind(kind, beside)
     return beside
+
+
+def file_given(kind: str, name: str) -> Path:
+    """The file that was given for a station, a camera or a vehicle. Raises: InputError when it plainly is another."""
+    path = shipped_or_path(kind, name)
+    _require_kind(kind, path)
+    return path
+
+
+def _require_kind(kind: str, path: Path) -> None:
+    found = kind_of_file(path)
+    if found not in ("", kind):
+        raise InputError(f"{path}: a {found} file, given as the {kind}; it belongs to --{found}")
 
 
 def shipped_or_path(kind: str, name: str) -> Path:
@@ -153,19 +189,59 @@ def prepare_sequence(folder: Path, force: bool) -> None:
     truth.write_bytes(b"")  # marks the folder as simulated, also when the simulation is cut short
 
 
-def open_any(
-    source: str, fps: float | None, *, topic: str | None = None, bits: int = 16, station: str | None = None
-) -> Source:
+def open_any(source: str, reading: Reading, *, delay_ms: float = 0.0, station: str | None = None) -> Source:
     """A recording by its path or a camera by its address; no colour is read for a `station` of white lights alone."""
-    gray = station is not None and set(load_station(shipped_or_path("station", station)).color) == {"white"}
-    return open_live(source, gray=gray) or open_source(Path(source), fps, topic=topic, bits=bits, gray=gray)
+    if not -_MAX_DELAY_MS <= delay_ms <= _MAX_DELAY_MS:
+        raise InputError(f"--delay-ms {delay_ms:g}: wanted a time within {_MAX_DELAY_MS:g} ms")
+    gray = station is not None and set(load_station(file_given("station", station)).color) == {"white"}
+    reading = replace(reading, gray=gray)
+    return delayed(open_live(source, gray=gray) or open_source(Path(source), reading), delay_ms)
 
 
-def calibration_of(given: str | None, source: Source) -> Camera:
-    """The camera by the option, beside the frames, or within the source. Raises: InputError where there is none."""
-    if given is None and source.camera is None and source.calibration is not None:
-        return source.calibration
-    return load_camera(file_of("camera", given, source.camera, source))
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A camera, the ROS camera_info file that it is from, if it is from one, and what is odd about it."""
+
+    camera: Camera
+    file: Path | None
+    warnings: tuple[str, ...]
+
+
+def calibration_of(given: str | None, source: Source, *, name: str | None = None, trusted: bool = False) -> Calibration:
+    """The camera by the option, beside the frames, or within the source, checked as `calib check` does.
+
+    Raises: InputError where there is none, or one that no camera has, unless it is `trusted`.
+    """
+    from lumidock.setup.calibration_files import read_with_dialect
+    from lumidock.streams.calibration_check import check, require_possible
+
+    if given is None and source.camera is None:
+        if source.calibration is not None:
+            return Calibration(source.calibration, None, check(source.calibration, rectified=source.rectified).warnings)
+        if source.no_calibration:
+            raise InputError(source.no_calibration)
+    path = file_of("camera", given, source.camera, source)
+    dialect, lens = read_with_dialect(path, name=name)
+    require_possible(lens, str(path), trusted=trusted)
+    # what the simulator wrote beside its frames needs no comment
+    simulated_one = given is None and (path.parent / "truth.csv").exists()
+    return Calibration(lens, path if dialect == "ros" else None, () if simulated_one else check(lens).warnings)
+
+
+def keep_camera(calibration: Calibration, target: Path) -> Path:
+    """Write the camera of a run into it; returns the file that identifies it, `target` where it was in none."""
+    if calibration.file is not None:
+        copy(calibration.file, target)
+        return calibration.file
+    target.unlink(missing_ok=True)  # a link, not what it points to
+    save_camera(calibration.camera, target)
+    return target
+
+
+def tell(lines: Iterable[str]) -> None:
+    """Print what a person should know, a line each, to standard error."""
+    for line in lines:
+        print(f"lumidock: warning: {' '.join(line.split())}", file=sys.stderr)
 
 
 def simulated(source: str, folder: Path, station: str | None, camera: str | None) -> Path:

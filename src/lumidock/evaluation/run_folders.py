@@ -10,7 +10,8 @@ from typing import Any
 from lumidock.errors import InputError, extra
 from lumidock.evaluation.metrics import evaluate
 from lumidock.streams.run_folder import identities
-from lumidock.streams.sources import Source, open_source
+from lumidock.streams.source import Source
+from lumidock.streams.sources import open_source
 
 _PARTS = ("source", "inputs_sha256", "inputs_sampled", "config", "counts")
 _MOST_DEEP = 4  # folders below the given one in which runs are looked for

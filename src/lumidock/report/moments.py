@@ -16,7 +16,7 @@ from lumidock.report.page import Mark, Picture
 from lumidock.report.view import RunView
 from lumidock.station import Station
 from lumidock.streams.overlay import View, around_lights, whole
-from lumidock.streams.sources import Item
+from lumidock.streams.source import Item
 
 _WIDTH, _QUALITY = 760, 82
 _BRIGHT, _MOST_GAIN = 220.0, 5.0  # grey level that the brightest spots are brought to

@@ -16,7 +16,7 @@ from lumidock.evaluation.claims import GuideClaims, PoseClaims, pose_error, true
 from lumidock.evaluation.metrics import evaluate, read_rows, true_poses
 from lumidock.station import Station, load_station
 from lumidock.streams.replay import read_fixes
-from lumidock.streams.sources import Source
+from lumidock.streams.source import Source
 
 KINDS = ("lateral", "axial", "angle")
 STAGES: tuple[Stage, ...] = get_args(Stage)

@@ -34,7 +34,7 @@ from lumidock.station import Station, load_station
 from lumidock.streams.images import decode_image
 from lumidock.streams.replay import read_fixes
 from lumidock.streams.run_folder import RunFolder
-from lumidock.streams.sources import Source
+from lumidock.streams.source import Source
 
 _FOUR = 4  # named lights of a layer that give a pose by it alone
 Dock = tuple[str, str]  # station and camera file
@@ -110,7 +110,7 @@ def _run_method(dock: Dock, method: str, sequence: Path, pictures: Pictures, out
     station, camera = _load(dock)
     files = Path(dock[0]), sequence / "camera.yaml"
     setup, inputs = Setup(method, False, Config(), *files), (sequence / "timestamps.csv",)
-    source = Source(sequence, "sequence", lambda: _items(pictures), len(pictures), inputs=inputs)
+    source = Source(sequence, "sequence", lambda _: _items(pictures), len(pictures), inputs=inputs)
     _warm(localizer_of(method, station, camera, Config()), pictures)
     with RunFolder(out, station.ids) as run_folder:
         for file, name in zip(files, ("station.yaml", "camera.yaml"), strict=True):

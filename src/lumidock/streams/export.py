@@ -14,7 +14,7 @@ from lumidock.errors import InputError, extra
 from lumidock.station import load_station
 from lumidock.streams.replay import read_fixes
 from lumidock.streams.sinks import FILE_KINDS, Scene, open_file_sink
-from lumidock.streams.sources import Item, Source
+from lumidock.streams.source import Item, Source
 from lumidock.streams.vehicle import Vehicle
 
 KINDS = (*FILE_KINDS, ".parquet")

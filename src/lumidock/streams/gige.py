@@ -9,27 +9,13 @@ import numpy as np
 
 from lumidock.datatypes import Frame, Unusable
 from lumidock.errors import FrameError, InputError
-from lumidock.streams.pixels import unpack
-from lumidock.streams.sources import Item
+from lumidock.streams.pixels import READ, supported, unpack
+from lumidock.streams.source import Item, Size
 
 _BUFFERS, _TIMEOUT_US, _LOST_AFTER = 4, 1_000_000, 5  # of these waits without a frame
-_COLORS = {"RGB8": "rgb8", "RGB8Packed": "rgb8", "BGR8": "bgr8", "BGR8Packed": "bgr8"}
-_SENSORS = {
-    "Mono": "mono",
-    "BayerRG": "bayer_rggb",
-    "BayerBG": "bayer_bggr",
-    "BayerGB": "bayer_gbrg",
-    "BayerGR": "bayer_grbg",
-}
-# encoding and how many bits count; 10 and 12 lie in the lower ones of 16
-_FORMATS = {name: (encoding, 8) for name, encoding in _COLORS.items()} | {
-    f"{name}{bits}": (f"{encoding}{8 if bits == 8 else 16}", bits)
-    for name, encoding in _SENSORS.items()
-    for bits in (8, 10, 12, 14, 16)
-}
 
 
-def frames_of(name: str) -> Iterator[Item]:
+def frames_of(name: str, size: Size | None = None) -> Iterator[Item]:
     """Frames of the camera `name`, or of the first that answers; the newest first, those that queued behind dropped.
 
     The stamp is when the first packet of the frame came in. Raises: InputError when there is none, or when it is lost.
@@ -37,15 +23,15 @@ def frames_of(name: str) -> Iterator[Item]:
     aravis, errors = _aravis()
     try:
         camera = aravis.Camera.new(name or None)
-        pixels = _FORMATS.get(camera.get_pixel_format_as_string())
-        if pixels is None:
-            raise InputError(f"gige:{name}: pixel format {camera.get_pixel_format_as_string()} is not supported")
+        pixels = str(camera.get_pixel_format_as_string())
+        if not supported(pixels):
+            raise InputError(f"gige:{name}: pixel format {pixels} is not supported; read are {READ}")
         stream = _stream_of(aravis, camera)
         for _ in range(_BUFFERS):
             stream.push_buffer(aravis.Buffer.new_allocate(camera.get_payload()))
         camera.start_acquisition()
         try:
-            yield from _frames(aravis, stream, pixels, name)
+            yield from _frames(aravis, stream, pixels, name, size)
         finally:
             camera.stop_acquisition()
     except errors as error:
@@ -75,7 +61,7 @@ def _aravis() -> tuple[Any, type[Exception]]:
     return Aravis, GLib.Error
 
 
-def _frames(aravis: Any, stream: Any, pixels: tuple[str, int], name: str) -> Iterator[Item]:  # noqa: ANN401
+def _frames(aravis: Any, stream: Any, pixels: str, name: str, size: Size | None) -> Iterator[Item]:  # noqa: ANN401
     number = waits = 0
     while True:
         buffer = stream.timeout_pop_buffer(_TIMEOUT_US)
@@ -89,12 +75,12 @@ def _frames(aravis: Any, stream: Any, pixels: tuple[str, int], name: str) -> Ite
         while newer is not None:
             stream.push_buffer(buffer)
             buffer, newer = newer, stream.try_pop_buffer()
-        yield _item(aravis, buffer, pixels, f"{number:06d}")
+        yield _item(aravis, buffer, pixels, f"{number:06d}", size)
         stream.push_buffer(buffer)
         number += 1
 
 
-def _item(aravis: Any, buffer: Any, pixels: tuple[str, int], name: str) -> Item:  # noqa: ANN401
+def _item(aravis: Any, buffer: Any, pixels: str, name: str, size: Size | None) -> Item:  # noqa: ANN401
     t_ns = int(buffer.get_system_timestamp())
     if buffer.get_status() != aravis.BufferStatus.SUCCESS:
         return Unusable(name, t_ns, "bad_frame", f"frame {name}: {buffer.get_status().value_nick}")
@@ -102,7 +88,7 @@ def _item(aravis: Any, buffer: Any, pixels: tuple[str, int], name: str) -> Item:
     data = np.frombuffer(buffer.get_data(), np.uint8)
     try:
         step = len(data) // max(height, 1)
-        image, encoding = unpack(data, pixels[0], (width, height), step, bits=pixels[1])
+        image, encoding = unpack(data, pixels, (width, height), step, wanted=size)
         return Frame(name, t_ns, image.copy(), encoding=encoding)
     except FrameError as error:
         return Unusable(name, t_ns, error.reason, f"frame {name}: {error}")

@@ -13,9 +13,10 @@ import numpy as np
 from lumidock.camera import Camera
 from lumidock.datatypes import Frame, Unusable
 from lumidock.picture import encoding_of
-from lumidock.streams.sources import Source
+from lumidock.streams.source import Source
 
 _GAP = 1.5  # an interval of that many median ones has lost a frame
+_LEAST_BITS = 9  # of pixels of 16 that are from a sensor and not from a dark picture
 _SATURATED, _SPARSE = 250, 7  # of 255; every so many pixels and rows, odd to meet every colour of a mosaic
 
 
@@ -28,11 +29,14 @@ class _Seen:
     t_ns: list[int] = field(default_factory=list)
     median_level: list[float] = field(default_factory=list)
     saturated: list[float] = field(default_factory=list)
+    deep: int = 0  # every bit that any pixel of 16 bits has
 
     def add(self, frame: Frame) -> None:
         height, width = frame.image.shape[:2]
         self.sizes[width, height, encoding_of(frame)] += 1
         sparse = frame.image[::_SPARSE, ::_SPARSE]
+        if sparse.dtype == np.uint16:
+            self.deep |= int(np.bitwise_or.reduce(sparse, axis=None))
         sparse = sparse if sparse.dtype == np.uint8 else sparse >> 8
         self.median_level.append(float(np.median(sparse)))
         self.saturated.append(float((sparse >= _SATURATED).mean()))
@@ -66,6 +70,7 @@ def inspect(
             {"width": width, "height": height, "encoding": encoding, "frames": count}
             for (width, height, encoding), count in seen.sizes.most_common()
         ],
+        "bits": seen.deep.bit_length() if _LEAST_BITS <= seen.deep.bit_length() < 16 else None,
         "calibration": _fit(seen, camera),
         "time": intervals(seen.t_ns),
         "exposure": {"median_level": _middle(seen.median_level), "saturated": _middle(seen.saturated)},

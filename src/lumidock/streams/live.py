@@ -1,29 +1,22 @@
-"""Cameras: RTSP and RTP streams, and V4L2 devices. A frame's stamp is the time of this machine when it was decoded."""
+"""Cameras by their address: RTSP and RTP streams, V4L2 devices and GigE Vision."""
 
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from lumidock.datatypes import Frame
-from lumidock.errors import InputError, extra
-from lumidock.streams.images import mono_if_gray
-from lumidock.streams.sources import Item, Source
+from lumidock.datatypes import Frame, Unusable
+from lumidock.errors import FrameError, InputError, extra
+from lumidock.streams.address import SCHEMES, address_of
+from lumidock.streams.clock import now_ns
+from lumidock.streams.images import mono_if_gray, require_size
+from lumidock.streams.source import Item, Size, Source
 
 _DEVICE = re.compile(r"/dev/video[0-9]{1,3}")
-
-
-_SINCE_EPOCH_NS = time.time_ns() - time.monotonic_ns()
-
-
-def now_ns() -> int:
-    """Time since the epoch, by the clock as it was at the start: setting it later does not make stamps jump."""
-    return _SINCE_EPOCH_NS + time.monotonic_ns()
 
 
 def open_live(address: str, *, gray: bool = False) -> Source | None:
@@ -35,17 +28,19 @@ def open_live(address: str, *, gray: bool = False) -> Source | None:
         from lumidock.streams import gige
 
         name = address.removeprefix("gige:")
-        return Source(Path(name or "gige"), "gige", lambda: gige.frames_of(name), live=True)
+        return Source(Path(name or "gige"), "gige", lambda size: gige.frames_of(name, size), live=True)
     if _DEVICE.fullmatch(address):
-        return Source(Path(address), "v4l2", lambda: _device(address), live=True)
-    if address.startswith(("rtsp://", "rtsps://", "rtp://")):
+        return Source(Path(address), "v4l2", lambda size: _device(address, size), live=True)
+    if address.startswith(tuple(f"{scheme}://" for scheme in SCHEMES)):
+        camera = address_of(address)
         with extra("video"):
-            from lumidock.streams.network import frames_of, without_password
-        return Source(Path(without_password(address)), "stream", lambda: frames_of(address, gray), live=True)
+            from lumidock.streams.network import frames_of
+        return Source(Path(camera.shown), "stream", lambda size: frames_of(camera, gray, size), live=True)
     return None
 
 
-def _device(path: str) -> Iterator[Item]:
+def _device(path: str, size: Size | None) -> Iterator[Item]:
+    """Frames of a V4L2 device; the stamp is when the driver handed one over."""
     capture = cv2.VideoCapture(path, cv2.CAP_V4L2)
     try:
         if not capture.isOpened():
@@ -55,8 +50,13 @@ def _device(path: str) -> Iterator[Item]:
         while capture.grab():
             t_ns = now_ns()
             decoded, image = capture.retrieve()
+            name = f"{number:06d}"
             if decoded:
-                yield Frame(f"{number:06d}", t_ns, mono_if_gray(np.asarray(image, np.uint8)))
+                try:
+                    require_size((image.shape[1], image.shape[0]), size, f"frame {name}")
+                    yield Frame(name, t_ns, mono_if_gray(np.asarray(image, np.uint8)))
+                except FrameError as error:
+                    yield Unusable(name, t_ns, error.reason, str(error))
             number += 1
     finally:
         capture.release()

@@ -23,6 +23,7 @@ from lumidock.errors import InputError
 from lumidock.streams.ros import Broken, Message, Topic, ros2_type
 
 _MAGIC = b"\x89MCAP0\r\n"
+_ENCODINGS = ("ros1", "cdr", "protobuf")
 _MAX_RECORD = 1 << 28  # a chunk of 256 MiB holds ten raw pictures of 24 megapixels
 _HEAD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 _LAST_OPCODE = int(Opcode.DATA_END)
@@ -83,7 +84,8 @@ class _Known:
             number, _, log_ns, _ = _MESSAGE.unpack_from(body)
             seen = self.channels.get(number)
             if seen is not None and (self.wanted is None or seen.topic in self.wanted):
-                encoding = "ros1" if seen.message_encoding == "ros1" else "cdr"
+                named = seen.message_encoding or "cdr"
+                encoding = named if named in _ENCODINGS else "unknown"
                 kind = self.schemas.get(seen.schema_id, "")
                 return Message(seen.topic, kind, encoding, log_ns, body[_MESSAGE.size :])
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import hashlib
 import io
 import json
@@ -15,6 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from lumidock.datatypes import Array, Fix, Protection
+from lumidock.errors import InputError
 from lumidock.geometry import bearing_and_range, quat_xyzw_from_rotation
 
 COVARIANCE_COLUMNS = tuple(f"c{i}{j}" for i in range(6) for j in range(i, 6))
@@ -39,9 +41,13 @@ class RunFolder:
     """Writes a run, each frame's rows in one piece; use as a context manager."""
 
     def __init__(self, folder: Path, light_ids: tuple[str, ...]) -> None:
-        """Start the run's files in `folder`, replacing those of an earlier run."""
+        """Start the run's files in `folder`, replacing those of an earlier run.
+
+        Raises: InputError where another process is still writing to it.
+        """
         self.folder, self.light_ids = folder, light_ids
         folder.mkdir(parents=True, exist_ok=True)
+        self._lock = _locked(folder)
         for name in _FILES:
             (folder / name).unlink(missing_ok=True)
         # unbuffered: a row is in the file, whole, or it is not
@@ -58,6 +64,8 @@ class RunFolder:
     ) -> None:
         for file in self._files.values():
             file.close()
+        if self._lock is not None:
+            os.close(self._lock)
 
     def add(self, fix: Fix, latency_us: int | None, *, t_ns: int | None) -> None:
         """Append one frame; `t_ns` is None, and its field empty, when the stamp could not be read."""
@@ -100,6 +108,25 @@ class RunFolder:
         for i, light in enumerate(fix.match.light):
             numbers = (*d.uv[i], d.radius_px[i], d.flux[i], d.p_light[i], d.p_rear[i])
             yield [fix.frame, *map(_number, numbers), self.light_ids[light] if light >= 0 else ""]
+
+
+def _locked(folder: Path) -> int | None:
+    """A lock on a folder, which the system gives up when this process ends; None where the file system has no locks.
+
+    Raises: InputError where another process has it.
+    """
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(held)
+        raise InputError(
+            f"{folder}: another process is writing a run there; write elsewhere, or end it first"
+        ) from None
+    except OSError:
+        os.close(held)
+        return None
+    return held
 
 
 def _fix_row(fix: Fix, latency_us: int | None, t_ns: int | None) -> list[object]:

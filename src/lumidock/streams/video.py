@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -10,9 +11,9 @@ import numpy as np
 from av.error import FFmpegError
 
 from lumidock.datatypes import Frame, Image, Unusable
-from lumidock.errors import InputError
-from lumidock.streams.images import MAX_PIXELS, mono_if_gray
-from lumidock.streams.sources import Item, Source
+from lumidock.errors import FrameError, InputError
+from lumidock.streams.images import MAX_PIXELS, mono_if_gray, require_size, turned
+from lumidock.streams.source import Item, Reading, Size, Source
 
 _TINT = 4  # grey levels; decoded gray is off by up to 3
 # no playlists: what a file names elsewhere is not opened
@@ -20,20 +21,50 @@ _FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,asf,nut,h264,h
 _OPTIONS = {"format_whitelist": _FORMATS, "protocol_whitelist": "file"}
 
 
-def open_video(path: Path, fps: float | None, gray: bool) -> Source:
-    """Open a video file; `fps` overrides its times, `gray` takes the luma plane alone where there is one.
+def open_video(path: Path, reading: Reading) -> Source:
+    """Open a video file; `fps` replaces its times, `gray` takes the luma plane alone where there is one.
 
-    Raises: InputError when there is nothing to decode.
+    Raises: InputError when there is nothing to decode, or no time and no `fps`.
     """
+    first = count = rate = None
     try:
         with av.open(str(path), options=_OPTIONS) as container:
-            count = _count(container.streams.video[0], container.duration)
-        decodable = any(isinstance(frame, av.VideoFrame) for frame in _decoded(path))
+            stream = container.streams.video[0]
+            count, rate = _count(stream, container.duration), stream.average_rate
+        first = next((frame for frame in _decoded(path) if isinstance(frame, av.VideoFrame)), None)
     except (FFmpegError, IndexError, ValueError):
-        decodable = False
-    if not decodable:
+        pass
+    if first is None:
         raise InputError(f"{path}: not a video that can be decoded")
-    return Source(path, "video", lambda: _items(path, fps, gray), count, inputs=(path,))
+    if reading.fps is None and stamp_of(first) is None:
+        raise InputError(f"{path}: a video without times; give --fps")
+    notes = (*_time_note(first, rate, reading.fps), *_rotation_note(first, reading.as_stored))
+    return Source(path, "video", lambda size: _items(path, reading, size), count, inputs=(path,), notes=notes)
+
+
+def _time_note(first: av.VideoFrame, rate: Fraction | None, fps: float | None) -> tuple[str, ...]:
+    if fps is None or stamp_of(first) is None:
+        return ()
+    own = f", {float(rate):.6g} frames a second on average," if rate else ""
+    return (f"the video's own times{own} are replaced by --fps {fps:g}",)
+
+
+def _rotation_note(first: av.VideoFrame, as_stored: bool) -> tuple[str, ...]:
+    if not first.rotation:
+        return ()
+    if as_stored:
+        return (f"the video's header says to turn it by {first.rotation} degrees; left as stored",)
+    if _orientation(first) == 1:
+        return (f"the video's header says to turn it by {first.rotation} degrees, which is not done; left as stored",)
+    return (
+        f"pictures are turned by {first.rotation} degrees (counterclockwise) as the video's header says, which the "
+        "calibration has to fit; or give --as-stored",
+    )
+
+
+def _orientation(frame: av.VideoFrame) -> int:
+    """The Exif orientation that turns a frame as its display matrix says: counterclockwise by `rotation` degrees."""
+    return {90: 8, 180: 3, 270: 6}.get(round(frame.rotation) % 360, 1)
 
 
 def _count(stream: av.VideoStream, duration: int | None) -> int | None:
@@ -43,19 +74,25 @@ def _count(stream: av.VideoStream, duration: int | None) -> int | None:
     return round(duration * stream.average_rate / av.time_base) if duration and stream.average_rate else None
 
 
-def _items(path: Path, fps: float | None, gray: bool) -> Iterator[Item]:
+def _items(path: Path, reading: Reading, size: Size | None) -> Iterator[Item]:
     for number, frame in enumerate(_decoded(path)):
         name = f"{number:06d}"
         if isinstance(frame, str):
             yield Unusable(name, None, "bad_frame", f"frame {name}: {frame}")
             continue
-        t_ns = round(number * 1e9 / fps) if fps else stamp_of(frame)
+        t_ns = round(number * 1e9 / reading.fps) if reading.fps else stamp_of(frame)
+        orientation = 1 if reading.as_stored else _orientation(frame)
         if t_ns is None:
             yield Unusable(name, None, "bad_stamp", f"frame {name}: no presentation time")
         elif frame.is_corrupt:
             yield Unusable(name, t_ns, "bad_frame", f"frame {name}: damaged")
         else:
-            yield Frame(name, t_ns, picture_of(frame, gray))
+            try:
+                shown = (frame.height, frame.width) if orientation >= 5 else (frame.width, frame.height)
+                require_size(shown, size, f"frame {name}")
+                yield Frame(name, t_ns, turned(picture_of(frame, reading.gray), orientation))
+            except FrameError as error:
+                yield Unusable(name, t_ns, error.reason, str(error))
 
 
 def stamp_of(frame: av.VideoFrame) -> int | None:
