@@ -45,7 +45,7 @@ def docking(scenario: str, seed: int, folder: str) -> dict[str, Any]:
         "frames": judged["frames"],
         "valid": judged["valid"],
         "guide": judged["guide"],
-        "wrong": judged["labels"]["wrong"],
+        "wrong": judged["identities"]["wrong"],
         "hazardous": hazards["valid"]["any"] + hazards["guide"]["any"],
     }
 

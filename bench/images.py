@@ -35,7 +35,7 @@ def simulate_and_run(scenario: str, seed: int, folder: Path) -> tuple[Path, Path
     return sequence, out
 
 
-def search_labels(sequence: Path, out: Path) -> tuple[int, int]:
+def search_identities(sequence: Path, out: Path) -> tuple[int, int]:
     """Frames with four or more front lights detected and no other spot taken for front; those of them named right."""
     true: dict[str, dict[str, np.ndarray]] = {}
     for row in read_rows(sequence / "lights_truth.csv", ("frame", "light", "u_px", "v_px")):
@@ -86,16 +86,16 @@ def main() -> tuple[dict[str, object], list[str]]:
     for seed in SEEDS:
         with TemporaryDirectory() as folder:
             result: dict[str, Any] = evaluate(*reversed(simulate_and_run("approach", seed, Path(folder))))
-        front, rear, labels = result["layers"]["front"], result["layers"]["rear"], result["labels"]
+        front, rear, identities = result["layers"]["front"], result["layers"]["rear"], result["identities"]
         lines.append(
             f"| {seed} | {front['first_z_m']:.2f} to {front['last_z_m']:.2f} | {rear['first_z_m']:.2f} to "
             f"{rear['last_z_m']:.2f} | {result['longest_gap_s']:.2f} | {result['layers']['offset_m']:.3f} "
-            f"| {labels['wrong']} of {labels['named']} |"
+            f"| {identities['wrong']} of {identities['identified']} |"
         )
         content[f"approach-{seed}"] = result
     lines.append("| paper | 18.62 to 1.73 | 10.07 to -3 | - | < 0.3 | - |")
     with TemporaryDirectory() as folder:
-        eligible, right = search_labels(*simulate_and_run("rectangle", SEEDS[0], Path(folder)))
+        eligible, right = search_identities(*simulate_and_run("rectangle", SEEDS[0], Path(folder)))
     reach = {gray: rear_reach_m(gray, SEEDS[0]) for gray in ("max", "luma")}
     content["rear_reach_m"] = reach
     content["rectangle"] = {"eligible": eligible, "right": right}

@@ -103,10 +103,16 @@ def write_lights_truth(folder, rows):
     (folder / "lights_truth.csv").write_text("frame,light,u_px,v_px,visible,snr\n" + "\n".join(rows) + "\n")
 
 
-def test_a_name_is_wrong_when_its_light_is_elsewhere_or_not_visible(judge, tmp_path):
-    write_lights_truth(tmp_path / "truth", ["a,A,0,22.9,1,9", "a,B,10,23.1,1,9", "a,C,20,20,0,1"])
-    result = judge({"a": pose(0, 0, 9)}, {"a": pose(0, 0, 9)}, lights={"a": [0, 1, 2, 3, -1]})
-    assert result["labels"] == {"named": 4, "wrong": 3}
+def test_an_identity_is_wrong_when_another_lit_lamp_is_nearer(judge, tmp_path):
+    one = {"a": pose(0, 0, 9)}
+    # A and C are right, though C saturates and has no SNR; B is too far off its own lamp; D is not in view at all
+    write_lights_truth(tmp_path / "truth", ["a,A,0,22.9,1,9", "a,B,10,23.1,1,9", "a,C,20,20,0,0"])
+    result = judge(one, one, lights={"a": [0, 1, 2, 3, -1]})
+    assert result["identities"] == {"identified": 4, "wrong": 1, "displaced": 1}
+    # A and B are exchanged; a dark lamp at the place of C's detection makes no light that C could be confused with
+    write_lights_truth(tmp_path / "truth", ["a,A,10,20,1,9", "a,B,0,20,1,9", "a,C,20,21,1,9", "a,D,20,20,0,0"])
+    result = judge(one, one, lights={"a": [0, 1, 2]})
+    assert result["identities"] == {"identified": 3, "wrong": 2, "displaced": 0}
 
 
 def test_frames_that_the_truth_lacks_are_not_judged(judge, tmp_path):
@@ -115,7 +121,7 @@ def test_frames_that_the_truth_lacks_are_not_judged(judge, tmp_path):
     result = judge(found, {"a": pose(0, 0, 9)}, lights={"a": [0], "b": [1, 2]}, layers=[("front", pose(0, 0, 9))])
     assert (result["frames"], result["valid"]) == (2, 2)
     assert_close(result["error"]["lateral_m"]["p95"], 0)
-    assert result["labels"] == {"named": 1, "wrong": 0}
+    assert result["identities"] == {"identified": 1, "wrong": 0, "displaced": 0}
     assert result["layers"]["front"]["fixes"] == 1
 
 

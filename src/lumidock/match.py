@@ -104,7 +104,7 @@ def plan(station: Station, camera: Camera, config: MatchConfig) -> Plan:
     rank, pairs, unseen = _pair_order(station)
     size = np.array([camera.width, camera.height]) / camera.focal_px
     volume = float(size.prod()) * config.far_m**3 / 3.0
-    is_rear = (behind == len(front_first) - 1).astype(np.int64)
+    is_rear = ((behind == len(front_first) - 1) & (behind > 0)).astype(np.int64)  # a lone layer is the front one
     return Plan(
         camera.lens(),
         np.ascontiguousarray(station.p_dock),
