@@ -28,7 +28,7 @@ _COLUMNS = (
     "last valid, z m",
     "longest gap in valid after, s (from z m)",
     "range error 5-7 m, mean / 95 %, mm",
-    "wrong names",
+    "wrong identities",
     "valid",
     "hazardous",
 )

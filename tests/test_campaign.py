@@ -220,7 +220,7 @@ def test_a_campaign_prints_its_table(lumidock, tmp_path):
 
 def test_a_scenario_file_and_its_config_are_used(lumidock, tmp_path):
     (tmp_path / "my.yaml").write_text(
-        "name: a|b/../c\nabout: x\npath: {kind: draws, count: 3}\nconfig: {paper: {max_spots: 2}}\n"
+        "name: a|b/../c\nabout: x\npath: {kind: draws, count: 3}\nconfig: {paper: {max_detections: 2}}\n"
     )
     words = ("campaign", tmp_path / "my.yaml", "--seeds", "0:1", *PAPER[:2], "--out", tmp_path / "out")
     code, out, _ = lumidock(*words, "--json")

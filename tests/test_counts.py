@@ -130,7 +130,7 @@ def test_wrong_names_are_told_from_harmful_coincidences():
 
 
 @pytest.mark.parametrize(("off_px", "coincident"), [(1.4, True), (1.6, False)])
-def test_a_stray_where_a_missing_light_would_be_is_a_coincidence(off_px, coincident):
+def test_a_spurious_detection_where_a_missing_light_would_be_is_a_coincidence(off_px, coincident):
     def answer(_, frame):
         fix = right(frame, match=Match(frame.detections, frame.light.copy()))
         frame.detections.uv[0] = frame.uv[frame.light[0]] + [off_px, 0.0]

@@ -198,7 +198,7 @@ def test_a_guide_counts_beside_the_pose(judge_fixes):
         fix_at("d", 1100, None, None, reason="too_few"),
         fix_at("e", 1500, near, guide_at(near)),
         fix_at("f", 1700, near, None),
-        fix_at("strange", 1800, near, None),
+        fix_at("unlike", 1800, near, None),
     ]
     result = judge_fixes(fixes, dict.fromkeys("abcd", T) | dict.fromkeys("efg", near))
     assert [result[name] for name in ("frames", "valid", "guide", "guide_only")] == [7, 4, 4, 2]
@@ -289,7 +289,7 @@ def test_the_residual_is_that_of_named_lights_at_the_estimated_pose(judge, tmp_p
     # light A at (-0.9, 0.7): seen head-on from 10 m, 1000 px of focal length put it 90 px left of (90, 90), 70 px up
     save_camera(Camera(200, 200, np.array([[1000.0, 0, 90], [0, 1000.0, 90], [0, 0, 1]])), tmp_path / "run/camera.yaml")
     T = pose(0, 0, 10)
-    # the spots are at (0, 20), (10, 20); named A the first is exact, the second is off by (10, 0)
+    # detections at (0, 20), (10, 20); identified as A the first is exact, the second is off by (10, 0)
     poses = {"a": T, "b": T, "c": None}
     result = judge(poses, dict.fromkeys("abc", T), lights={"a": [0], "b": [-1, 0], "c": [0]})
     assert_close(result["residual_rms_px"], np.sqrt(10.0**2 / 4), atol=1e-4)

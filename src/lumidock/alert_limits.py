@@ -105,8 +105,9 @@ class AlertLimits:
         """The limits in one line, for people."""
         last, guide = self.bands[-1], self.guide
         parts = [
-            f"z < {b.below_z_m:g} m: lateral {b.lateral_m:g} m, axial {b.axial_m:g} m, {math.degrees(b.angle_rad):.3g} deg"
-            for b in self.bands
+            f"z < {band.below_z_m:g} m: lateral {band.lateral_m:g} m, axial {band.axial_m:g} m, "
+            f"{math.degrees(band.angle_rad):.3g} deg"
+            for band in self.bands
         ]
         far_deg = math.degrees(max(_FAR_RAD, last.angle_rad))
         parts.append(f"beyond: {_FAR_SHARE:.0%} of z but not less than before, {far_deg:.3g} deg")

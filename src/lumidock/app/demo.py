@@ -101,8 +101,8 @@ def summary_lines(result: dict[str, Any], counts: dict[str, Any]) -> list[str]:
     ]
     if error := result["error"]:
         lines += [
-            f"error       median {error['lateral_m']['median']:.3f} m lateral, {error['axial_m']['median']:.3f} m axial, "
-            f"{error['angle_deg']['median']:.2f} deg",
+            f"error       median {error['lateral_m']['median']:.3f} m lateral, "
+            f"{error['axial_m']['median']:.3f} m axial, {error['angle_deg']['median']:.2f} deg",
             f"identities  {wrong['wrong']} of {wrong['identified']} identified detections are another light",
         ]
     if result["nees"]["frames"]:

@@ -45,16 +45,16 @@ from lumidock.cli.shared import (
     prepare_sequence,
     progress_bar,
     require_folder,
-    told_at_interrupt,
     shipped_or_path,
     simulated,
+    told_at_interrupt,
 )
 from lumidock.config import Config, load_config
 from lumidock.datatypes import Fix
 from lumidock.errors import InputError, LumidockError
 from lumidock.methods import METHODS, localizer_of, require_method
 from lumidock.station import load_station
-from lumidock.streams.sources import Item, open_source
+from lumidock.streams.sources import Item
 
 _MAX_SEED = 10**9
 _COMMANDS = (

@@ -7,9 +7,9 @@ from dataclasses import asdict
 
 import typer
 
+from lumidock.app.settings_text import as_yaml
 from lumidock.cli.shared import AsJson, ConfigOption, app, example
 from lumidock.config import Config, load_config
-from lumidock.settings_text import as_yaml
 
 config = typer.Typer(help="Show the settings.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(config, name="config")

@@ -119,9 +119,8 @@ def _print_integrity(result: dict[str, Any]) -> None:
         print("  6 on average where covariances are right; more: too small; less: too wide, as where survey and")
         print("  calibration are better than the station file states")
     if nis := result["nis"]:
-        print(
-            f"NIS per degree of freedom {nis['mean']:.2f} over {nis['frames']} frames; 1 on average where noise is as stated"
-        )
+        print(f"NIS per degree of freedom {nis['mean']:.2f} over {nis['frames']} frames")
+        print("  1 on average where the noise of the centroids is as stated")
     if nees["improper"]:
         print(f"covariances that are not positive definite: {nees['improper']}")
 

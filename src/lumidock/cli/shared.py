@@ -218,7 +218,10 @@ Report = Callable[[int, int | None], None]
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Report]:
-    """Progress on standard error, a bar on a terminal and a line every ten seconds elsewhere; a callback (done, total)."""
+    """Progress on standard error: a bar on a terminal, elsewhere a line every ten seconds.
+
+    Yields a callback (done, total).
+    """
     console = Console(stderr=True)
     if not console.is_terminal:
         yield _PlainProgress(title).report

@@ -55,7 +55,7 @@ def _check(
 def _print(result: dict[str, Any]) -> None:
     layers = ", ".join(f"{layer} {count}" for layer, count in result["layers"].items())
     print(f"{result['name']}: {layers} lights")
-    print(f"alert limits: {result['alert_limits']}")
+    print("alert limits:\n  " + result["alert_limits"].replace("; ", "\n  "))
     print("\nhead-on approach to the docking point; the expected protection levels are the best that the lights allow:")
     print(f"{'z, m':>6}  {'stage':10}  {'lights in view':24}  lateral m  axial m  angle deg")
     for row in result["corridor"]:

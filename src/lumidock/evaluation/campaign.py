@@ -50,7 +50,7 @@ Progress = Callable[[int, int | None], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shard:
-    """One scenario, one method and the seeds `first` to `stop` - 1; `key` is a hash of all that its counts depend on."""
+    """One scenario, one method and the seeds `first` to `stop` - 1; `key` hashes all that its counts depend on."""
 
     scenario: Scenario
     config: Config

@@ -184,6 +184,5 @@ def _too_few_in_view(
         if which.any()
     ]
     where = ", ".join(f"{z:g}" for z in short)
-    return [
-        f"fewer than {required.lights} lights of any layer in view at z {where} m; at {short[0]:g} m: {', '.join(parts)}"
-    ]
+    text = f"fewer than {required.lights} lights of any layer in view at z {where} m"
+    return [f"{text}; at {short[0]:g} m: {', '.join(parts)}"]

@@ -36,7 +36,7 @@ class Crop:
         return round(float(x)), round(float(y))
 
     def cut(self, image: Image) -> Image:
-        """This part of an 8-bit image (H, W[, 3]), scaled."""
+        """The part of an 8-bit image (H, W[, 3]), scaled."""
         window = image[self.v : self.v + self.height, self.u : self.u + self.width]
         size = (round(self.width * self.scale), round(self.height * self.scale))
         way = cv2.INTER_AREA if self.scale < 1 else cv2.INTER_LINEAR

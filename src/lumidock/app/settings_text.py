@@ -17,7 +17,7 @@ _MAX_WIDTH = 118
 
 
 def as_yaml(settings: BaseModel) -> str:
-    """All fields of nested settings as YAML, each with the comment that its source has: its unit, meaning and origin."""
+    """All fields of nested settings as YAML, each with its comment in the source: unit, meaning and origin."""
     return "".join(f"{line}\n" for line in _lines(settings, 0))
 
 
