@@ -257,9 +257,9 @@ def test_claims_agree_with_those_of_one_at_a_time():
     frames = list(simulated_frames(load_scenario("any-roll", ("path.count=30",)), STATION, CAMERA, 0))
     pairs = [(frame, right(frame, T_dock_cam=moved(frame, (0.1, 0.2, 0.3), (0.1, -0.3, 0.2)))) for frame in frames]
     errors = [claims.pose_error(fix.T_dock_cam, frame.T_dock_cam) for frame, fix in pairs]
-    np.testing.assert_allclose(pose_claims(pairs).errors, errors, atol=1e-12)
+    np.testing.assert_allclose(pose_claims(pairs, STATION.alert_limits).errors, errors, atol=1e-12)
     true = [claims.true_guide(frame.T_dock_cam) for frame in frames]
-    np.testing.assert_allclose(guide_claims(pairs).true, true, atol=1e-12)
+    np.testing.assert_allclose(guide_claims(pairs, STATION.alert_limits).true, true, atol=1e-12)
 
 
 def test_quantiles_of_a_histogram_are_good_to_a_hundredth(rng):

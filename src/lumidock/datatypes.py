@@ -144,7 +144,15 @@ class Detections:
         require_shape("uv", centroids, None, 2)
         n = len(centroids)
         unknown = np.full(n, np.nan)
-        return cls(frame, t_ns, centroids, unknown, unknown, np.ones(n), unknown if p_rear is None else p_rear)
+        return cls(
+            frame,
+            t_ns,
+            centroids,
+            radius_px=unknown,
+            flux=unknown,
+            p_light=np.ones(n),
+            p_rear=unknown if p_rear is None else p_rear,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ import sys
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import cv2
 import typer
@@ -189,7 +189,11 @@ def _run(
             let_interrupt()
 
         summary = run_source(opened, localizer, folder, setup, on_fix=on_fix)
-    counts = summary.as_dict()
+    _print_counts(summary.as_dict(), out, as_json)
+
+
+def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:
+    """The counts of a run, for people or as JSON."""
     if as_json:
         print(json.dumps(counts, indent=2))
         return

@@ -146,13 +146,18 @@ def _serve(
         print(f"health at http://{host}:{page.port}/", file=sys.stderr if as_json else sys.stdout, flush=True)
         with _stopped_by_signals(stop):
             server.serve()
-    counts = server.counts
-    if as_json:
-        print(json.dumps({**{word: counts[word] for word in ("frames", "valid", "guide")}, "dropped": newest.dropped}))
-    else:
-        print(f"{counts['frames']} frames: {counts['valid']} valid; {newest.dropped} came too fast and were dropped")
+    _print_counts(server, as_json)
     if reader.problem and not opened.live:
         raise InputError(reader.problem)
+
+
+def _print_counts(server: Server, as_json: bool) -> None:
+    """The counts of all that was served, for people or as JSON."""
+    counts, dropped = server.counts, server.newest.dropped
+    if as_json:
+        print(json.dumps({word: counts[word] for word in ("frames", "valid", "guide")} | {"dropped": dropped}))
+    else:
+        print(f"{counts['frames']} frames: {counts['valid']} valid; {dropped} came too fast and were dropped")
 
 
 def _health_page(host: str, port: int, server: Server) -> HealthPage:

@@ -137,7 +137,10 @@ def plan(
             what = shared | {"scenario": scenario, "config": config.model_dump_json(), "method": method}
             for first, stop in _blocks(seeds):
                 key = _digest(json.dumps(what | {"seeds": [first, stop]}).encode())[:16]
-                shards.append(Shard(parsed, config, method, cold, first, stop, station, camera, key, bound))
+                shard = Shard(
+                    parsed, config, method, cold, first, stop, station=station, camera=camera, key=key, bound=bound
+                )
+                shards.append(shard)
     identity = shared | {
         "scenarios": [scenario.model_dump(mode="json") for scenario in scenarios],
         "methods": list(methods),

@@ -92,7 +92,7 @@ def _draw_projected(canvas: Image, uv: Array, station: Station, crop: Crop) -> N
     for light, at in enumerate(uv):
         if np.isfinite(at).all() and (np.abs(at) < 1e4).all():
             color = bgr(of_layer(station, light))
-            cv2.drawMarker(canvas, crop.at(at), color, cv2.MARKER_TILTED_CROSS, 8, 1, cv2.LINE_AA)
+            cv2.drawMarker(canvas, crop.at(at), color, cv2.MARKER_TILTED_CROSS, 8, thickness=1, line_type=cv2.LINE_AA)
 
 
 def _draw_detections(canvas: Image, match: Match, station: Station, crop: Crop) -> None:
@@ -132,4 +132,4 @@ def _write(canvas: Image, text: str, at: tuple[int, int], color: tuple[int, int,
     y = max(height + 3, min(at[1], canvas.shape[0] - below))
     ground = canvas[y - height - 3 : y + below, max(x - 3, 0) : x + width + 3]
     ground[...] = (ground * _SHADE).astype(np.uint8)
-    cv2.putText(canvas, text, (x, y), _FONT, size, color, 1, cv2.LINE_AA)
+    cv2.putText(canvas, text, (x, y), _FONT, size, color, thickness=1, lineType=cv2.LINE_AA)
