@@ -88,7 +88,7 @@ def test_a_station_file_replaces_the_limits(tmp_path):
 BAND = {"below_z_m": 2.0, "lateral_m": 0.05, "axial_m": 0.1, "angle_deg": 2.0}
 WRONG = {
     "falling": ([BAND, BAND | {"below_z_m": 5.0, "lateral_m": 0.01}], "tighter than those nearer"),
-    "out of order": ([BAND, BAND], "has to rise"),
+    "out of order": ([BAND, dict(BAND)], "has to rise"),
     "two guides": ([{"guide": {}}, {"guide": {}}], "guide is given twice"),
     "no limit": ([BAND | {"lateral_m": 0.0}], "lateral_m"),
     "infinite": ([BAND | {"axial_m": math.inf}], "axial_m"),
@@ -99,7 +99,7 @@ WRONG = {
 
 @pytest.mark.parametrize(("limits", "match"), WRONG.values(), ids=WRONG)
 def test_limits_that_cannot_be_are_refused(tmp_path, limits, match):
-    with refused(match):
+    with refused(tmp_path, match):
         station_with(tmp_path, alert_limits=limits)
 
 

@@ -252,6 +252,17 @@ def detections(tmp_path):
     return items
 
 
+def test_bare_detections_need_no_column_of_files(tmp_path):
+    (tmp_path / "timestamps.csv").write_text("frame,t_ns\n1,5\n")
+    (tmp_path / "detections.csv").write_text("frame,u_px,v_px\n1,2.5,-3\n")
+    (only,) = open_source(tmp_path).items()
+    assert_array_equal(only.uv, [[2.5, -3]])
+    assert_array_equal(only.p_light, [1.0])
+    (tmp_path / "detections.csv").unlink()
+    with refused(tmp_path / "timestamps.csv", "no column file"):
+        open_source(tmp_path)
+
+
 def test_detections_are_read_with_what_is_known_of_them(detections):
     first, second = detections("1,2.5,-3,4,50,0.5,1\n9,1,1,,,,\n1,7,8,,,,\n")
     assert [told(first), told(second)] == [("1", 5, ""), ("2", 6, "")]

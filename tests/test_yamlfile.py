@@ -134,16 +134,16 @@ OTHER_KINDS = {
 @pytest.mark.parametrize(("text", "match"), OTHER_KINDS.values(), ids=OTHER_KINDS)
 def test_a_file_of_another_kind_is_recognised(tmp_path, text, match):
     (tmp_path / "a.yaml").write_text(text)
-    with refused(match):
+    with refused(tmp_path / "a.yaml", match):
         load_station(tmp_path / "a.yaml")
 
 
 def test_a_camchain_for_a_camera_is_told_how_to_become_one(tmp_path):
     (tmp_path / "a.yaml").write_text("cam0: {intrinsics: [1, 2, 3, 4]}")
-    with refused("lumidock calib import"):
+    with refused(tmp_path / "a.yaml", "lumidock calib import"):
         load_camera(str(tmp_path / "a.yaml"))
     (tmp_path / "b.yaml").write_text("schema: 1\nlights: []")
-    with refused("this is a station file, wanted a camera file"):
+    with refused(tmp_path / "b.yaml", "this is a station file, wanted a camera file"):
         load_camera(tmp_path / "b.yaml")
 
 
@@ -158,5 +158,5 @@ def test_a_camchain_for_a_camera_is_told_how_to_become_one(tmp_path):
     ],
 )
 def test_an_unknown_key_suggests_the_nearest_and_lists_its_section(setting, match):
-    with refused(match):
+    with refused("approach", match):
         load_scenario("approach", (setting,))

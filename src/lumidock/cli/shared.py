@@ -246,17 +246,19 @@ class _PlainProgress:
     def __init__(self, title: str) -> None:
         self._title, self._start_s = title, time.monotonic()
         self._next_s = self._start_s + PLAIN_EVERY_S
+        self._first: tuple[float, int] | None = None  # the rate counts from the first item on, which may compile code
 
     def report(self, done: int, total: int | None) -> None:
         """Print a line if the last one was long enough ago."""
         now = time.monotonic()
+        self._first = self._first or (now, done)
         if now < self._next_s:
             return
         self._next_s = now + PLAIN_EVERY_S
-        elapsed_s = now - self._start_s
-        line = f"{self._title}: {done}{f' of {total}' if total else ''}, elapsed {duration(elapsed_s)}"
-        if total and done:
-            line += f", remaining about {duration(elapsed_s * (total - done) / done)}"
+        line = f"{self._title}: {done}{f' of {total}' if total else ''}, elapsed {duration(now - self._start_s)}"
+        first_s, first_done = self._first
+        if total and done > first_done:
+            line += f", remaining about {duration((now - first_s) * (total - done) / (done - first_done))}"
         print(line, file=sys.stderr, flush=True)
 
 
