@@ -284,7 +284,7 @@ def _campaign(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run scenarios x seeds x methods on bare detections, and count availability, errors and hazards."""
+    """Run scenarios x seeds x methods on bare detections, and count."""
     from lumidock.evaluation.campaign import plan, prepare, run_campaign, tabulate
     from lumidock.evaluation.campaign_table import markdown
     from lumidock.sim.scenario import load_scenario

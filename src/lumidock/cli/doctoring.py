@@ -17,7 +17,7 @@ app.add_typer(config, name="config")
 
 @app.command("doctor", epilog=example("lumidock doctor", "lumidock doctor --json"))
 def _doctor(as_json: AsJson = False) -> None:
-    """Check this machine; exit code 1 when something keeps lumidock from working."""
+    """Check this machine; exit code 1 when something is wrong."""
     from lumidock.app.doctor import examine
 
     findings = examine()

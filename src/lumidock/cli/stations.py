@@ -35,7 +35,7 @@ def _check(
     from_z: Annotated[float, typer.Option(metavar="Z", help="... from this many metres to the docking point.")] = 20.0,
     as_json: AsJson = False,
 ) -> None:
-    """Check which lights are in view, which are confused and how good a pose can be; exit code 1 on a failed check."""
+    """Check what is in view, confused and measured; exit code 1 on failure."""
     from lumidock.evaluation.station_check import Requirements, inspect_station
     from lumidock.report.station_picture import draw_station
 
