@@ -1,11 +1,15 @@
 """Overlays, the trajectory plot and the contact sheet: they are made, and show what they should."""
 
+import re
+import sys
 from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 from bench.shipped import shipped_camera, shipped_station
 
+from lumidock.app import demo
 from lumidock.datatypes import Detections, Fix, Match
 from lumidock.pose import project_lights
 from lumidock.report.stills import contact_sheet, plot_trajectory
@@ -102,3 +106,20 @@ def test_a_dim_image_is_brightened_and_a_bright_one_left_alone():
     assert gain > 3.0
     assert seen[100, 100, 0] > 180
     assert brightened(np.full((20, 20), 250, np.uint8))[1] == 1.0
+
+
+@pytest.mark.parametrize("extras", [True, False], ids=["all extras", "base install"])
+def test_the_demo_does_its_job_with_and_without_extras(lumidock, monkeypatch, tmp_path, extras):
+    if not extras:
+        for module in ("av", "matplotlib"):
+            monkeypatch.setitem(sys.modules, module, None)  # as if it were not installed
+    monkeypatch.setattr(demo, "SETTINGS", (*demo.SETTINGS, "path.start_z_m=9", "path.frame_interval_s=2.4"))
+    code, out, err = lumidock("demo", "--out", tmp_path / "demo", "--seed", "3")
+    assert (code, err) == (0, "")
+    made = {path.name for path in (tmp_path / "demo").iterdir()}
+    always = {"sequence", "run", "stages.jpg"}
+    assert made == (always | {"annotated.mp4", "report.html", "trajectory.png"} if extras else always)
+    assert ("pip install 'lumidock[video]'" in out) == ("pip install 'lumidock[report]'" in out) == (not extras)
+    assert re.search(r"^identities  0 of \d+ identified", out, re.MULTILINE)
+    if extras:
+        assert b"avc1" in (tmp_path / "demo" / "annotated.mp4").read_bytes()[:2000]  # H.264, which browsers play

@@ -16,7 +16,7 @@ from lumidock.camera import Camera
 from lumidock.datatypes import Fix, Frame, Image, Stage
 from lumidock.picture import developed
 from lumidock.station import Station
-from lumidock.streams.overlay import around_lights, brightened, draw, whole
+from lumidock.streams.overlay import around_lights, draw, whole
 from lumidock.streams.sinks import ImageSink, open_video
 from lumidock.streams.sources import Item
 
@@ -71,7 +71,7 @@ class Album:
             return
         image = developed(item)
         if self._writer is not None:
-            picture = draw(brightened(image)[0], fix, self.station, self.camera, whole(image, _WIDTH))
+            picture = draw(image, fix, self.station, self.camera, whole(image, _WIDTH))
             self._writer.add(picture, item.t_ns)
         if not fix.valid and fix.guide is None:
             return
@@ -79,7 +79,7 @@ class Album:
         slot: Stage = "search" if self._usable.total() == 1 else fix.stage  # the very first fix ends the search
         if self._usable[fix.stage] <= _FIX_SHOWN[slot]:
             near = around_lights(image, fix, _WIDTH)
-            self.by_stage[slot] = draw(brightened(image)[0], fix, self.station, self.camera, near)
+            self.by_stage[slot] = draw(image, fix, self.station, self.camera, near, brighten=True)
 
     def sheet(self) -> list[Image]:
         """One picture per stage, in the order of the approach; an even number of them."""

@@ -51,7 +51,7 @@ def sections_of(view: RunView, prefix: str, *, alone: bool, most_images: int | N
     """The sections about one run, the images first; `prefix` makes the ids of its figures unique on the page."""
     found = {plot.name.removeprefix(f"{prefix}-"): plot for plot in figures.of_run(view, prefix)}
     of = "" if alone else f": {view.name}"
-    shown = annotated_images(view, (8 if alone else 2) if most_images is None else most_images)
+    shown = annotated_images(view, (9 if alone else 1) if most_images is None else most_images)
     path = [found[name] for name in ("trajectory",) if name in found]
     errors = [found[name] for name in ("levels", "guide", "stanford") if name in found]
     judged = [table for table in (tables.by_range(view), tables.integrity(view)) if table is not None]

@@ -103,7 +103,7 @@ def _middle(frames: np.ndarray) -> int | None:
 
 def _annotated(view: RunView, fix: Fix, image: Image, title: str) -> AnnotatedImage:
     crop = around_lights(image, fix, _WIDTH)
-    small, gain = brightened(crop.cut(image))
+    small, gain = brightened(crop.cut(image), crop.scale)
     done, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     assert done
     height, width = small.shape[:2]

@@ -14,7 +14,8 @@ from lumidock.station import Station
 from lumidock.streams.colors import SPURIOUS_ON_WATER, bgr, of_layer
 
 LEAST_P_LIGHT = 0.1  # less probable detections that were not identified are not drawn: they would hide the others
-_BRIGHT, _MOST_GAIN = 220.0, 5.0  # grey level that the brightest lights are brought to, and by how much at most
+_BRIGHT, _MOST_GAIN = 220.0, 16.0  # grey level that the brightest lights are brought to, and by how much at most
+_WATER_SHARE = 0.8  # of the colour of the water, that is taken away before
 _TEXT = (235, 235, 235)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _SHADE = 0.35  # of its brightness is left of the image behind a text
@@ -60,14 +61,17 @@ def around_lights(image: Image, fix: Fix, width: int) -> Crop:
     return Crop(int(u), int(v), int(size[0]), int(size[1]), width / int(size[0]))
 
 
-def brightened(image: Image) -> tuple[Image, float]:
-    """An 8-bit image in which a person can see the lights, and the factor by which its contrast was raised."""
-    brightest = float(np.percentile(image, 99.98))
-    water = 0.7 * float(np.median(image))
-    gain = min(_MOST_GAIN, _BRIGHT / max(brightest - water, 1.0))
-    if brightest > _BRIGHT / 1.1:
+def brightened(image: Image, grain_px: float = 1.0) -> tuple[Image, float]:
+    """An 8-bit image in which a person can see the lights, and the factor by which its contrast was raised.
+
+    Noise is smoothed over `grain_px`, the size of a pixel of the camera; a bright image is left as it is.
+    """
+    if float(np.percentile(image, 99.98)) > _BRIGHT / 1.1:
         return image, 1.0
-    return np.clip((image.astype(np.float32) - water) * gain, 0.0, 255.0).astype(np.uint8), gain
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), max(grain_px, 0.5))
+    water = _WATER_SHARE * np.median(smooth, axis=(0, 1))
+    gain = min(_MOST_GAIN, _BRIGHT / max(float(np.percentile(smooth - water, 99.98)), 1.0))
+    return np.clip((smooth - water) * gain, 0.0, 255.0).astype(np.uint8), gain
 
 
 def shown_detections(match: Match) -> np.ndarray:
@@ -75,14 +79,16 @@ def shown_detections(match: Match) -> np.ndarray:
     return np.flatnonzero((match.light >= 0) | ~(match.detections.p_light < LEAST_P_LIGHT))
 
 
-def draw(image: Image, fix: Fix, station: Station, camera: Camera, crop: Crop) -> Image:
+def draw(image: Image, fix: Fix, station: Station, camera: Camera, crop: Crop, *, brighten: bool = False) -> Image:
     """A copy of the `crop` of an 8-bit image (H, W[, 3]) with detections, light ids, projected lights and the pose."""
-    canvas = crop.cut(image)
+    canvas = brightened(crop.cut(image), crop.scale)[0] if brighten else crop.cut(image)
     canvas = np.asarray(cv2.cvtColor(canvas, cv2.COLOR_GRAY2BGR), np.uint8) if canvas.ndim == 2 else canvas
+    if fix.match is not None:  # ids first: where lights crowd, no ring or cross is hidden behind the ground of a text
+        _draw_ids(canvas, fix.match, station, crop)
     if fix.T_dock_cam is not None:
         _draw_projected(canvas, project_lights(camera, fix.T_dock_cam, station.p_dock), station, crop)
     if fix.match is not None:
-        _draw_detections(canvas, fix.match, station, crop)
+        _draw_rings(canvas, fix.match, station, crop)
     _draw_caption(canvas, fix)
     return canvas
 
@@ -95,15 +101,20 @@ def _draw_projected(canvas: Image, uv: Array, station: Station, crop: Crop) -> N
             cv2.drawMarker(canvas, crop.at(at), color, cv2.MARKER_TILTED_CROSS, 8, thickness=1, line_type=cv2.LINE_AA)
 
 
-def _draw_detections(canvas: Image, match: Match, station: Station, crop: Crop) -> None:
-    """A ring around each detection that is shown, with the id of its light; red where it is spurious."""
-    detections = match.detections
+def _draw_ids(canvas: Image, match: Match, station: Station, crop: Crop) -> None:
+    """The id of its light beside each identified detection."""
+    for k in np.flatnonzero(match.light >= 0):
+        (u, v), light = crop.at(match.detections.uv[k]), int(match.light[k])
+        ring = ring_px(float(match.detections.radius_px[k]), crop)
+        _write(canvas, station.ids[light], (u + round(ring) + 3, v - 4), bgr(of_layer(station, light)), 0.5)
+
+
+def _draw_rings(canvas: Image, match: Match, station: Station, crop: Crop) -> None:
+    """A ring around each detection that is shown, in the colour of its layer; red where it is spurious."""
     for k in shown_detections(match):
-        (u, v), light = crop.at(detections.uv[k]), int(match.light[k])
-        ring, color = ring_px(float(detections.radius_px[k]), crop), bgr(of_layer(station, light))
-        cv2.circle(canvas, (u, v), round(ring), color, 1, cv2.LINE_AA)
-        if light >= 0:
-            _write(canvas, station.ids[light], (u + round(ring) + 3, v - 4), color, 0.5)
+        ring = ring_px(float(match.detections.radius_px[k]), crop)
+        color = bgr(of_layer(station, int(match.light[k])))
+        cv2.circle(canvas, crop.at(match.detections.uv[k]), round(ring), color, 1, cv2.LINE_AA)
 
 
 def ring_px(radius_px: float, crop: Crop) -> float:
