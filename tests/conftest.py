@@ -1,5 +1,6 @@
 """What the tests share: seeded draws, strategies for SE(3), numeric derivatives, closeness, refusals, a small run."""
 
+import math
 import shutil
 import socket
 import sys
@@ -20,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from test_run import simulate
 
 from lumidock import cli
+from lumidock.cli import shared
 from lumidock.errors import InputError
 
 settings.register_profile("lumidock", derandomize=True, deadline=None, database=None, max_examples=200)
@@ -107,6 +109,7 @@ def lumidock(monkeypatch, capfd):
 
     def call(*words):
         monkeypatch.setattr(sys, "argv", ["lumidock", *map(str, words)])
+        monkeypatch.setattr(shared, "PLAIN_EVERY_S", math.inf)  # a slow machine prints progress, which no test is about
         with pytest.raises(SystemExit) as exited:
             cli.main()
         return exited.value.code, *capfd.readouterr()

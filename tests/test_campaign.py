@@ -54,7 +54,7 @@ def test_the_table_is_the_same_for_any_number_of_workers(whole, tmp_path):
     assert finish(small(), tmp_path / "two", workers=2) == whole
     table = json.loads(whole[0])
     assert table["rows"][0]["counts"]["frames"] == 12 * 8
-    assert table["rows"][0]["counts"]["named"] == 12 * 8 * 6
+    assert table["rows"][0]["counts"]["identified"] == 12 * 8 * 6
 
 
 def test_a_campaign_takes_up_where_it_was(whole, tmp_path, monkeypatch):

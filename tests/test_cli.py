@@ -12,6 +12,7 @@ from test_sources import write_video
 
 from lumidock import cli, methods
 from lumidock.camera import save_camera
+from lumidock.cli import shared
 from lumidock.datatypes import Fix, Guide, Protection
 from lumidock.sim.scenario import shipped_scenarios
 
@@ -44,6 +45,34 @@ def test_the_version_is_printed_and_nothing_else_done(lumidock):
     code, out, err = lumidock("--version", "run")
     assert (code, err) == (0, "")
     assert out.strip().replace(".", "").isdigit()
+
+
+def test_progress_without_a_terminal_is_plain_lines(monkeypatch, capsys):
+    monkeypatch.setattr(shared, "PLAIN_EVERY_S", 0.0)
+    with shared.progress_bar("simulating") as progress:
+        for done in (1, 2, 4):
+            progress(done, 4)
+        progress(5, None)
+    lines = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(r"simulating: 1 of 4, elapsed 0:00:0\d", lines[0])
+    assert re.fullmatch(r"simulating: 2 of 4, elapsed 0:00:0\d, remaining about 0:00:0\d", lines[1])
+    assert re.fullmatch(r"simulating: 5, elapsed 0:00:0\d", lines[3])
+    monkeypatch.setattr(shared, "PLAIN_EVERY_S", 10.0)
+    with shared.progress_bar("quick") as progress:
+        progress(1, 2)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0:00:00"), (61, "0:01:01"), (3600 * 30 + 59.6, "30:01:00")])
+def test_durations(seconds, text):
+    assert shared.duration(seconds) == text
+
+
+def test_every_command_that_ends_in_figures_speaks_json(lumidock):
+    for command in ("run", "sim", "eval", "campaign", "demo", "export", "report", "reproduce", "serve", "doctor"):
+        assert "--json" in lumidock(command, "--help")[1], command
+    for command in (("station", "check"), ("calib", "check")):
+        assert "--json" in lumidock(*command, "--help")[1], command
 
 
 # The whole way
@@ -94,7 +123,7 @@ def test_shipped_detections_from_simulation_to_evaluation(lumidock, tmp_path):
     assert lumidock("run", tmp_path / "sim", *PAPER, "--out", tmp_path / "run")[0] == 0
     code, out, _ = lumidock("eval", tmp_path / "run", tmp_path / "sim")
     assert code == 0
-    assert {"front:", "rear:", "names:"} <= set(out.split())
+    assert {"front:", "rear:", "identities:"} <= set(out.split())
 
 
 @pytest.mark.parametrize("seed", [0, 7])
@@ -166,7 +195,7 @@ def test_an_evaluation_tells_what_the_claims_are_worth(lumidock, guesser, bare, 
     assert any(line.split()[:4] == ["all", "7", "3", "3"] for line in lines)
     assert any(re.match(r"guide but over the alert limit \d of 7 frames", line) for line in lines)
     assert any(re.match(r"error over the protection level: lateral \d of 3, .*, range \d of 3", line) for line in lines)
-    assert any(re.match(r"NEES [\d.]+ over 3 frames, honest is 6: front [\d.]+$", line) for line in lines)
+    assert any(re.match(r"NEES [\d.]+ over 3 frames \(front [\d.]+\)$", line) for line in lines)
     assert max(map(len, lines)) <= 120
 
 
@@ -176,7 +205,7 @@ def test_an_evaluation_of_the_papers_method_tells_of_no_claims(lumidock, bare, e
     assert "NEES" not in out
     assert "protection level" not in out
     assert re.search(r"^valid but over the alert limit 0 of 7 frames$", out, re.MULTILINE)
-    assert re.search(r"^named lights 0\.\d\d px rms", out, re.MULTILINE)
+    assert re.search(r"^identified lights 0\.\d\d px rms", out, re.MULTILINE)
 
 
 def test_a_truth_that_lacks_frames_is_enough(lumidock, sequence, earlier):

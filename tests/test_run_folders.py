@@ -11,7 +11,8 @@ from lumidock.app.run import Setup, run
 from lumidock.config import Config
 from lumidock.errors import InputError
 from lumidock.evaluation.metrics import evaluate
-from lumidock.evaluation.run_folders import described, evaluate_all, find_runs, flat, source_of, write_table
+from lumidock.evaluation.run_description import read_description
+from lumidock.evaluation.run_folders import evaluate_all, find_runs, flat, source_of, write_table
 from lumidock.localizer import Localizer
 from lumidock.sim.scenario import load_scenario
 from lumidock.sim.sequence import write_detections
@@ -93,9 +94,9 @@ def test_a_source_too_large_to_hash_is_known_by_its_samples(runs, tmp_path, monk
     station, source = shipped_station(), open_source(runs / "sequence")
     with RunFolder(out, station.ids) as folder:
         run(source, Localizer(station, shipped_camera()), folder, Setup("lumidock", False, Config(), stamps, stamps))
-    assert "timestamps.csv" in described(out)["inputs_sampled"]
-    assert source_of(out, described(out), runs / "sequence").path == runs / "sequence"
+    assert "timestamps.csv" in read_description(out)["inputs_sampled"]
+    assert source_of(out, read_description(out), runs / "sequence").path == runs / "sequence"
     other = shutil.copytree(runs / "sequence", tmp_path / "other")
     (other / "timestamps.csv").write_text(stamps.read_text() + "\n")
     with pytest.raises(InputError, match="not what"):
-        source_of(out, described(out), other)
+        source_of(out, read_description(out), other)

@@ -68,6 +68,17 @@ def test_every_key_is_read(load):
     assert (station.sigma_focal, station.sigma_center_px) == (0.01, 5.0)
 
 
+def test_a_light_may_have_its_own_sigma(load):
+    text = FULL.replace("position: [-1, 0, 0]", "position: [-1, 0, 0], sigma_m: 0.03")
+    station = load(text.replace("position: [1, 0, 0]", "position: [1, 0, 0], sigma_m: [0.01, 0.02, 0.005]"))
+    assert_array_equal(station.sigma_light_m, [0.004, 0.03, 0.02, 0.004])  # of three the largest, never a smaller one
+
+
+@pytest.mark.parametrize(("text", "wanted"), [("", True), ("dock_exclusive: false", False)])
+def test_a_dock_is_exclusive_unless_its_file_says_otherwise(load, text, wanted):
+    assert load(f"{SMALL}{text}\n").dock_exclusive is wanted
+
+
 def test_layers_are_told_by_name_and_depth(load):
     station = load(FULL)
     assert station.layers == ("rear", "front")
@@ -136,6 +147,8 @@ REFUSALS = {
     "beam of nothing": ("id: F1", "id: F1, beam_deg: 0", "lights.0.beam_deg"),
     "beam over a full turn": ("id: F1", "id: F1, beam_deg: 361", "lights.0.beam_deg"),
     "no power": ("id: F1", "id: F1, power_w: 0", "lights.0.power_w"),
+    "sigma of a light negative": ("id: F1", "id: F1, sigma_m: -0.1", "lights.0.sigma_m"),
+    "sigma of a light of two numbers": ("id: F1", "id: F1, sigma_m: [0.1, 0.1]", "lights.0.sigma_m"),
     "negative sigma": ("name: small", "name: small\nsurvey_sigma: {light_m: -1}", "survey_sigma.light_m"),
     "infinite sigma": (
         "name: small",

@@ -341,4 +341,4 @@ def test_lights_that_do_not_hold_together_have_a_large_innovation():
     wrong = start(T_cam_dock, swapped, measured(uv))
     right = start(T_cam_dock, assigned(BOTH), measured(uv))
     assert right.last.deviate < 0.0
-    assert wrong is None or wrong.last.deviate > CONFIG.track.max_surprise
+    assert wrong is None or wrong.last.deviate > CONFIG.track.max_deviate

@@ -7,7 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict
 
+from lumidock.camera import load_camera
 from lumidock.errors import InputError
+from lumidock.sim.scenario import load_scenario
+from lumidock.station import load_station
 from lumidock.yamlfile import MAX_BYTES, read_mapping, validate
 
 REFUSALS = {
@@ -117,3 +120,43 @@ def test_validate_names_the_place(content, text):
         validate(Settings, content, "here")
     assert str(caught.value).startswith(text)
     assert len(str(caught.value).splitlines()) == 1
+
+
+OTHER_KINDS = {
+    "camera": ("image_width: 5\ncamera_matrix: {}", "this is a camera file, wanted a station file"),
+    "camchain": ("cam0: {intrinsics: [1, 2, 3, 4]}", "this is a Kalibr camchain file, wanted a station file"),
+    "vehicle": ("schema: 1\nT_body_cam: {}", "this is a vehicle file"),
+    "configuration": ("match: {noise_px: 1}\ntrack: {}", "this is a configuration file"),
+    "scenario": ("name: x\npath: {}\nwater: {}", "this is a scenario file"),
+}
+
+
+@pytest.mark.parametrize(("text", "match"), OTHER_KINDS.values(), ids=OTHER_KINDS)
+def test_a_file_of_another_kind_is_recognised(tmp_path, text, match):
+    (tmp_path / "a.yaml").write_text(text)
+    with refused(tmp_path / "a.yaml", match):
+        load_station(tmp_path / "a.yaml")
+
+
+def test_a_camchain_for_a_camera_is_told_how_to_become_one(tmp_path):
+    (tmp_path / "a.yaml").write_text("cam0: {intrinsics: [1, 2, 3, 4]}")
+    with refused(tmp_path / "a.yaml", "lumidock calib import"):
+        load_camera(str(tmp_path / "a.yaml"))
+    (tmp_path / "b.yaml").write_text("schema: 1\nlights: []")
+    with refused(tmp_path / "b.yaml", "this is a station file, wanted a camera file"):
+        load_camera(tmp_path / "b.yaml")
+
+
+@pytest.mark.parametrize(
+    ("setting", "match"),
+    [
+        ("path.speed_ms=1", r"path.speed_ms: unknown key, did you mean speed_m_s\? \(known here: kind, start_z_m, "),
+        ("lamps.layer=all", "lamps.layer: unknown key, did you mean layers"),
+        ("wter.kind=1", "wter: unknown key, did you mean water"),
+        ("detections.attitude.bias=3", "detections.attitude.bias: unknown key, did you mean bias_deg"),
+        ("path.zzz=1", r"path.zzz: unknown key \(known here: kind"),
+    ],
+)
+def test_an_unknown_key_suggests_the_nearest_and_lists_its_section(setting, match):
+    with refused("approach", match):
+        load_scenario("approach", (setting,))

@@ -95,7 +95,7 @@ def gather(state: LocalizerState, followed: Sequence[Track], found: Acquisition,
     state is `confirmed` where one stands out and passes its test.
     """
     context, config = moment.context, moment.context.config
-    new = [*found.hypotheses, *found.other_poses][: config.track.beliefs]
+    new = [*found.hypotheses, *found.other_poses][: config.track.hypotheses]
     begun = [_renewed(hypothesis, new, followed, moment, state.calibration) for hypothesis in new]
     others = [one for one in followed if not any((one.last.assignment == h.assignment).all() for h in new)]
     tracks = likeliest([*others, *(one for one in begun if one is not None)], context)

@@ -293,12 +293,12 @@ class _CameraInfo(BaseModel):
     binning_y: Annotated[int, Field(ge=0)] = 0
 
 
-def load_camera(path: Path) -> Camera:
+def load_camera(path: Path | str) -> Camera:
     """Read a ROS camera_info YAML file.
 
     Raises: InputError, one line, for what is missing, not finite, of the wrong length or not supported.
     """
-    return camera_of_mapping(read_mapping(path), path)
+    return camera_of_mapping(read_mapping(Path(path)), Path(path))
 
 
 def camera_of_mapping(content: dict[str, Any], path: Path) -> Camera:

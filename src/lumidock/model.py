@@ -84,7 +84,7 @@ def station_model(station: Station, camera: Camera, config: MatchConfig) -> Stat
         lights=Lights(camera.lens(), np.ascontiguousarray(station.p_dock), station.axis),
         layer=station.layer,
         n_layers=len(station.layers),
-        is_rear=(behind == len(front_first) - 1).astype(np.int64),
+        is_rear=((behind == len(front_first) - 1) & (behind > 0)).astype(np.int64),  # a lone layer is the front one
         survey_m2=station.sigma_light_m**2 + (behind > 0)[station.layer] * 2.0 * station.sigma_layer_m**2,
         order=_pair_order(station),
         planes=_planes(station),
@@ -160,7 +160,7 @@ def measurements(detections: Detections, model: StationModel, config: MatchConfi
     p_light = np.array(detections.p_light, np.float64)
     frame = Measurements(uv, cov, np.empty(n), np.empty((n, model.n_layers)), p_light, 0.0)
     radius_px, p_rear = np.ascontiguousarray(detections.radius_px), np.ascontiguousarray(detections.p_rear)
-    looks = Appearance(config.label_trust, config.strange, _MOST_RADIUS_PX, _P_USUAL)
+    looks = Appearance(config.label_trust, config.unlikely_radii, _MOST_RADIUS_PX, _P_USUAL)
     span = weigh(radius_px, p_rear, model.is_rear, looks, frame)
     lens, share = model.lights.lens, config.clutter_near
     whole = lens[6] * lens[7]

@@ -341,7 +341,7 @@ def _update(
         estimates_calibration=both,
         log_weight=track.log_weight + log_evidence,
         agreeing_frames=track.agreeing_frames + int(seen_now.agreed_ns == track.t_ns),
-        mean_deviate=_mean(track.mean_deviate, deviate, config.strain_memory),
+        mean_deviate=_mean(track.mean_deviate, deviate, config.deviate_memory),
     )
 
 

@@ -9,13 +9,13 @@ import sys
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import cv2
 import typer
 
 from lumidock.camera import load_camera
-from lumidock.cli import calibration, doctoring, evaluation, exporting, inspection, reporting, serving, stations
+from lumidock.cli import calibration, demo, doctoring, evaluation, exporting, inspection, reporting, serving, stations
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
@@ -54,6 +54,7 @@ from lumidock.cli.shared import (
     shipped_or_path,
     simulated,
     tell,
+    told_at_interrupt,
     warn_if_nothing_is_kept,
 )
 from lumidock.config import Config, load_config
@@ -62,7 +63,6 @@ from lumidock.errors import InputError, LumidockError
 from lumidock.methods import METHODS, localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.source import Item, Reading
-from lumidock.streams.sources import open_source
 
 _MAX_SEED = 10**9
 _COMMANDS = (
@@ -73,12 +73,13 @@ _COMMANDS = (
     serving,
     calibration,
     stations,
+    demo,
     doctoring,
 )  # importing them adds their commands
 
 
 def main() -> None:
-    """Entry point: every error that is the user's to mend is one line and exit code 2."""
+    """Entry point: every error that the user can correct is one line and exit code 2."""
     _keep_streams_clean()
     try:
         code = app(standalone_mode=False, prog_name="lumidock")
@@ -89,7 +90,7 @@ def main() -> None:
         sys.exit(130)
     except LumidockError as error:
         _fail(str(error))
-    except BrokenPipeError:  # whoever read our output has left
+    except BrokenPipeError:  # the program that read the output has ended
         _drop_output()
         sys.exit(1)
     except OSError as error:
@@ -99,7 +100,7 @@ def main() -> None:
 
 
 def _keep_streams_clean() -> None:
-    """Let any file name be printed, and the libraries below us not print at all."""
+    """Let any file name be printed, and silence the log messages of OpenCV and FFmpeg."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -108,7 +109,7 @@ def _keep_streams_clean() -> None:
 
 
 def _drop_output() -> None:
-    """Give up what cannot be written, or the interpreter would complain of it at its end."""
+    """Discard output that cannot be written, or the interpreter would report it when it ends."""
     try:
         print(end="", flush=True)
     except OSError:
@@ -185,7 +186,13 @@ def _run(
     if out.is_dir() and opened.path.is_dir() and out.samefile(opened.path):
         raise InputError(f"{out}: is the source; write the run elsewhere")
     prepare_folder(out, force)
-    with RunFolder(out, dock.ids) as folder, progress_bar("run") as progress, interrupts_held() as let_interrupt:
+    left = f"{out} holds a complete row for every frame so far; `run` with --force begins again"
+    with (
+        told_at_interrupt(left),
+        RunFolder(out, dock.ids) as folder,
+        progress_bar("run") as progress,
+        interrupts_held() as let_interrupt,
+    ):
         copy(station_file, out / "station.yaml")
         camera_file = keep_camera(calibration, out / "camera.yaml")
         setup = Setup(method, cold, settings, station_file, camera_file)
@@ -197,7 +204,11 @@ def _run(
 
         size = lens.width, lens.height
         summary = run_source(opened, localizer, folder, setup, on_fix=on_fix, size=size)
-    counts = summary.as_dict()
+    _print_counts(summary.as_dict(), out, as_json)
+
+
+def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:
+    """The counts of a run, for people or as JSON."""
     if as_json:
         print(json.dumps(counts, indent=2))
         return
@@ -226,13 +237,16 @@ def _sim(
     ] = None,
     detections: Annotated[
         bool,
-        typer.Option("--detections", help="Bare detections, without rendering: path, faults and spots alone count."),
+        typer.Option(
+            "--detections", help="Bare detections, without rendering: only path, faults and detections count."
+        ),
     ] = False,
     video: Annotated[bool, typer.Option("--video", help="Pictures as video.mp4 instead of frames/.")] = False,
     workers: Workers = None,
     station: StationOption = None,
     camera: CameraOption = None,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Simulate SCENARIO into a sequence folder with truth."""
     from lumidock.sim.scenario import load_scenario
@@ -250,16 +264,20 @@ def _sim(
     if detections:
         frames = write_detections(loaded, dock, lens, seed, out)
     else:
-        with progress_bar("sim") as progress:
+        left = f"{out} holds an incomplete sequence, which `run` refuses; the same command with --force begins again"
+        with told_at_interrupt(left), progress_bar("sim") as progress:
             frames = write_rendered(loaded, dock, lens, seed, out, video=video, workers=workers, progress=progress)
-    print(f"{frames} frames written to {out}")
+    print(json.dumps({"frames": frames, "folder": str(out)}) if as_json else f"{frames} frames written to {out}")
 
 
 @app.command("campaign", epilog=example("lumidock campaign nominal --seeds 0:100 --out CAMPAIGN"))
 def _campaign(
     scenarios: Annotated[list[str], typer.Argument(metavar="SCENARIO", help=f"{SCENARIOS}, or .yaml files.")],
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder to write; the same campaign goes on where it was.")
+        Path,
+        typer.Option(
+            "--out", metavar="DIR", help="Folder to write; the same command continues an interrupted campaign."
+        ),
     ],
     seeds: Annotated[str, typer.Option(metavar="A:B", help="Seeds A to B - 1, a run of each scenario each.")] = "0:10",
     methods: Annotated[
@@ -274,7 +292,7 @@ def _campaign(
         str | None, typer.Option(metavar="ADDRESS", help="Run on the dask cluster there: tcp://HOST:PORT.")
     ] = None,
     bound: Annotated[
-        bool, typer.Option("--bound", help="Also count where the lights in view owe a valid fix (slower).")
+        bool, typer.Option("--bound", help="Also count in which frames the lights in view allow a valid fix (slower).")
     ] = False,
     station: StationOption = None,
     camera: CameraOption = None,
@@ -298,8 +316,9 @@ def _campaign(
         bound=bound,
     )
     prepare(campaign, out, force=force)
+    left = f"{out} holds the finished shards; the same command continues with the others"
     warn_if_nothing_is_kept()
-    with progress_bar("campaign") as progress:
+    with told_at_interrupt(left), progress_bar("campaign") as progress:
         speed = run_campaign(campaign, out, workers=workers, cluster=cluster, progress=progress)
     table = tabulate(campaign, out)
     if as_json:
@@ -334,61 +353,3 @@ def _warm() -> None:
     for name, _ in warm_up(Localizer(dock, lens).process, dock, lens):
         print(f"ready for {name}", flush=True)
     print(compiled_code().text)
-
-
-@app.command("demo", epilog=example("lumidock demo --force"))
-def _demo(
-    out: Out = Path("demo-out"),
-    seed: Seed = 0,
-    force: Force = False,
-) -> None:
-    """Simulate a docking, run it, and leave files and pictures."""
-    from lumidock.app.demo import Album, summary_lines
-    from lumidock.app.run import Setup
-    from lumidock.app.run import run as run_source
-    from lumidock.evaluation.metrics import evaluate, true_poses
-    from lumidock.localizer import Localizer
-    from lumidock.report import page, report
-    from lumidock.report.stills import contact_sheet, plot_trajectory
-    from lumidock.sim.scenario import load_scenario
-    from lumidock.sim.sequence import write_rendered
-    from lumidock.streams.run_folder import RunFolder
-
-    prepare_folder(out, force)
-    sequence, run_folder = out / "sequence", out / "run"
-    prepare_sequence(sequence, True)
-    scenario = load_scenario("approach")
-    station_file, camera_file = (
-        shipped_or_path("station", DEFAULT_STATION),
-        shipped_or_path("camera", DEFAULT_CAMERA),
-    )
-    dock, lens = load_station(station_file), load_camera(camera_file)
-    copy(station_file, sequence / "station.yaml")
-    warn_if_nothing_is_kept()
-    with progress_bar("simulating") as progress:
-        write_rendered(scenario, dock, lens, seed, sequence, progress=progress)
-    source = open_source(sequence)
-    setup = Setup("lumidock", False, Config(), station_file, camera_file)
-    video = out / "annotated.mp4"
-    with (
-        RunFolder(run_folder, dock.ids) as folder,
-        progress_bar("localizing") as progress,
-        interrupts_held() as let_interrupt,
-        Album(dock, lens, video, 1.0 / scenario.path.frame_interval_s) as album,
-    ):
-
-        def on_fix(item: Item, fix: Fix) -> None:
-            album.add(item, fix)
-            progress(len(album.fixes), source.count)
-            let_interrupt()
-
-        copy(station_file, run_folder / "station.yaml")
-        copy(camera_file, run_folder / "camera.yaml")
-        summary = run_source(source, Localizer(dock, lens), folder, setup, on_fix=on_fix)
-    result = evaluate(run_folder, sequence)
-    plot_trajectory(album.fixes, true_poses(sequence), dock, out / "trajectory.png")
-    contact_sheet(album.sheet(), out / "stages.jpg")
-    page.write(out / "report.html", report([run_folder], [sequence]))
-    print("\n".join(summary_lines(result, summary.as_dict())))
-    shown = (out / "report.html", out / "trajectory.png", out / "stages.jpg", video, run_folder / "fixes.csv")
-    print(f"look at     {', '.join(map(str, shown))}")
