@@ -10,9 +10,9 @@ from bench.shipped import shipped_camera, shipped_station
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lumidock._kernels import render as kernel
-from lumidock._kernels.raycast import FAR_M
-from lumidock._kernels.shading import Lights, Medium, RunDraws
+from lumidock._kernels.rendering import render as kernel
+from lumidock._kernels.rendering.raycast import FAR_M
+from lumidock._kernels.rendering.shading import Lights, Medium, RunDraws
 from lumidock.camera import Camera
 from lumidock.errors import InputError
 from lumidock.sim.knobs import Output

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lumidock._kernels.compiling import entry, part
-from lumidock._kernels.raycast import BOX, CELLS, FAR_M, RING, Solids, between, hit, list_blockers, may_hit
-from lumidock._kernels.shading import (
+from lumidock._kernels.rendering.raycast import BOX, CELLS, FAR_M, RING, Solids, between, hit, list_blockers, may_hit
+from lumidock._kernels.rendering.shading import (
     BANDS,
     DIFFUSE,
     GLOSSY,
@@ -27,6 +27,7 @@ from lumidock.datatypes import Array, Indices
 BLOCK = 16  # samples a side of what is shaded at once at most
 _SHARP = 30.0  # exponent of a curved surface's glossy lobe from which on parts of more than `_FINE` could miss its peak
 _FINE = 4
+_MARGIN = 1.1  # on the angle from the middle of a block to its corner, as rays between the corners are blended
 _FAINTS = 4.0  # of `World.faint`, what is added to that: less than the read noise
 _TOLERANCE = 0.03  # relative error of the light in the middle of a part that is interpolated
 
@@ -51,7 +52,8 @@ class Scratch(NamedTuple):
     """Room for one block.
 
     `rays` (B, B, 3), `etendue` (B, B); which solid and face was hit, `what` (B, B), at which range, `far` (B, B); the
-    `light` (B, B, 9) of samples; solids that the block may show, `some` (S,); parts that wait, `stack` (64, 3).
+    `light` (B, B, 9) of samples; `all` solids, `some` that the block may show and a `few` that a part of it may show,
+    (S + 1,) each with their number first; parts that wait, `stack` (64, 3).
     """
 
     rays: Array
@@ -59,7 +61,9 @@ class Scratch(NamedTuple):
     what: Indices
     far: Array
     light: Array
+    all: Indices
     some: Indices
+    few: Indices
     stack: Indices
 
 
@@ -97,23 +101,35 @@ def _aim(sight: Sight, row: int, column: int, own: Scratch) -> None:
 
 
 @part
-def _cast(solids: Solids, spread: float, own: Scratch) -> None:
-    """The first hit of every sample of a block."""
-    count, middle = 0, own.rays[BLOCK // 2, BLOCK // 2]
-    for s in range(len(solids.kind)):
-        if may_hit(solids, s, 0.0, 0.0, 0.0, middle[0], middle[1], middle[2], spread):
-            own.some[count] = s
+def _keep(solids: Solids, among: Indices, ray: Array, half_angle: float, kept: Indices) -> None:
+    """Of the solids `among[1:1 + among[0]]`, put those into `kept` that rays around one may hit."""
+    count = 0
+    for k in range(among[0]):
+        s = among[k + 1]
+        if may_hit(solids, s, 0.0, 0.0, 0.0, ray[0], ray[1], ray[2], half_angle):
             count += 1
-    for i in range(BLOCK):
-        for j in range(BLOCK):
-            dx, dy, dz = own.rays[i, j]
-            near, what = FAR_M, -1
-            for k in range(count):
-                s = own.some[k]
-                t, face = hit(solids, s, 0.0, 0.0, 0.0, dx, dy, dz)
-                if 0.0 < t < near:
-                    near, what = t, 4 * s + face
-            own.far[i, j], own.what[i, j] = near, what
+            kept[count] = s
+    kept[0] = count
+
+
+@part
+def _cast(solids: Solids, spread: float, own: Scratch) -> None:
+    """The first hit of every sample of a block; only what a small part of it may show is tried there."""
+    _keep(solids, own.all, own.rays[BLOCK // 2, BLOCK // 2], _MARGIN * 0.5 * spread, own.some)
+    for top in range(0, BLOCK, _FINE):
+        for left in range(0, BLOCK, _FINE):
+            middle = own.rays[top + _FINE // 2, left + _FINE // 2]
+            _keep(solids, own.some, middle, _MARGIN * 0.5 * spread * _FINE / BLOCK, own.few)
+            for i in range(top, top + _FINE):
+                for j in range(left, left + _FINE):
+                    dx, dy, dz = own.rays[i, j]
+                    near, what = FAR_M, -1
+                    for k in range(own.few[0]):
+                        s = own.few[k + 1]
+                        t, face = hit(solids, s, 0.0, 0.0, 0.0, dx, dy, dz)
+                        if 0.0 < t < near:
+                            near, what = t, 4 * s + face
+                    own.far[i, j], own.what[i, j] = near, what
 
 
 @part
@@ -350,6 +366,8 @@ def scratch(solids: int) -> Scratch:
         what=np.zeros((BLOCK, BLOCK), np.int64),
         far=np.zeros((BLOCK, BLOCK)),
         light=np.zeros((BLOCK, BLOCK, PARTS)),
-        some=np.zeros(max(solids, 1), np.int64),
+        all=np.concatenate([[solids], np.arange(solids)]),
+        some=np.zeros(solids + 1, np.int64),
+        few=np.zeros(solids + 1, np.int64),
         stack=np.zeros((64, 3), np.int64),
     )

@@ -9,9 +9,9 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from lumidock._kernels import render as kernel
-from lumidock._kernels.raycast import FAR_M, Solids
-from lumidock._kernels.shading import Lights, Medium, RunDraws
+from lumidock._kernels.rendering import render as kernel
+from lumidock._kernels.rendering.raycast import FAR_M, Solids
+from lumidock._kernels.rendering.shading import Lights, Medium, RunDraws
 from lumidock.datatypes import Array
 from lumidock.geometry import se3_inverse, transform_points
 from lumidock.sim import around

@@ -62,7 +62,7 @@ FINISHES = {
         mottle=0.15,
         mottle_m=0.9,
     ),
-    "concrete": Finish(albedo=(0.10, 0.20, 0.22), mottle=0.6, mottle_m=0.9),
+    "concrete": Finish(albedo=(0.05, 0.14, 0.18), mottle=0.6, mottle_m=0.9),
     "silt": Finish(albedo=(0.03, 0.05, 0.06), mottle=0.5, mottle_m=1.2),
     "jelly": Finish(albedo=(0.20, 0.22, 0.24), gloss=0.02, shininess=200.0, pattern="sectors", period=0.4, share=0.3,
                     second=(0.12, 0.12, 0.14)),

@@ -20,7 +20,16 @@ from lumidock.sim.scenario import Scenario, load_scenario
 
 TABLE = "detector_errors.json"
 KINDS = ("front", "rear", "false")  # spots of lights by layer, and those of nothing that the scenario calls a light
-_PICTURE = {"water", "daylight", "lamps", "around", "lens", "sensor", "output"}  # what decides how a light looks
+_PICTURE = {
+    "water",
+    "daylight",
+    "lamps",
+    "around",
+    "matter",
+    "lens",
+    "sensor",
+    "output",
+}  # what decides how a light looks
 
 
 @dataclass(frozen=True, slots=True, eq=False)

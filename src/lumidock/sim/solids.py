@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lumidock._kernels.raycast import BOX, ELLIPSOID, FRUSTUM, RING, Solids
-from lumidock._kernels.shading import PLAIN, SECTORS, STRIPES, TILES, Surfaces
+from lumidock._kernels.rendering.raycast import BOX, ELLIPSOID, FRUSTUM, RING, Solids
+from lumidock._kernels.rendering.shading import PLAIN, SECTORS, STRIPES, TILES, Surfaces
 from lumidock.datatypes import Array
 from lumidock.geometry import se3_inverse
 from lumidock.sim.matter import Basin, Finish, Jellyfish, Matter, Solid
@@ -75,7 +75,7 @@ def cage(station: Station) -> list[Solid]:
 def funnel(station: Station) -> list[Solid]:
     """A white cone with dark struts and a rim inside the ring of lamps, a hub with screws, arms to the lamps."""
     lamps_m = float(np.hypot(station.p_dock[:, 0], station.p_dock[:, 1]).min())
-    rim, hub, deep = 0.86 * lamps_m, 0.2 * lamps_m, 0.55 * lamps_m
+    rim, hub, deep = 0.91 * lamps_m, 0.2 * lamps_m, 0.55 * lamps_m
     front = np.array([0.0, 0.0, -0.03])
     bottom = front - [0.0, 0.0, deep]
     parts = [tube(front, bottom, rim, "funnel", hub)]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lumidock._kernels.compiling import part
-from lumidock._kernels.raycast import BOX, Solids, between, cell_of, normal, to_local
+from lumidock._kernels.rendering.raycast import BOX, Solids, between, cell_of, normal, to_local
 from lumidock.datatypes import Array, Indices
 
 PLAIN, TILES, SECTORS, STRIPES = range(4)
@@ -20,6 +20,7 @@ BANDS = 3
 DIFFUSE, GLOSSY, WATER, PARTS = 0, 3, 6, 9  # where the parts of a sample's light begin, three bands each
 _PER_PI = 1.0 / math.pi
 _OFF_SURFACE_M = 5e-4  # from where a shadow ray starts
+_LOBE_END = 25.0  # of n (1 - cosine), where cosine^n is under 1e-10 and not worth its time
 _NOTHING = 0.02  # share of `World.faint` below which a lamp adds nothing that could be seen
 # share of daylight that a wall gets from the side, and a ceiling from below: radiance distribution and irradiance
 # reflectance of coastal water. Source: C. Mobley, Light and Water, 1994, ch. 10
@@ -103,8 +104,10 @@ def lobe(shininess: float, cosine: float) -> float:
     Source: J. Blinn, SIGGRAPH 1977; its integral over the hemisphere is 8 pi (2^(-n/2) + n) / ((n + 2) (n + 4)).
     """
     n = shininess
-    scale = (n + 2.0) * (n + 4.0) / (8.0 * math.pi * (2.0 ** (-0.5 * n) + n))
-    return scale * max(cosine, 0.0) ** n
+    if cosine <= 0.0 or n * (1.0 - cosine) > _LOBE_END:
+        return 0.0
+    edge = 2.0 ** (-0.5 * n) if n < 2.0 * _LOBE_END else 0.0
+    return (n + 2.0) * (n + 4.0) / (8.0 * math.pi * (edge + n)) * cosine**n
 
 
 @part
@@ -144,7 +147,9 @@ def reflected(
         lx, ly, lz, facing = lx / r, ly / r, lz / r, facing / r
         axis = lights.axis[lamp]
         ahead = -(lx * axis[0] + ly * axis[1] + lz * axis[2])
-        beam = ahead ** lights.exponent[lamp] if ahead > 0.0 else 0.0
+        beam = 0.0
+        if ahead > 0.0:
+            beam = ahead if lights.exponent[lamp] == 1.0 else ahead ** lights.exponent[lamp]
         # E = pi L a^2 / (r^2 + a^2) on the axis of a diffuse disc of radius a, which has I = pi a^2 L
         scale = facing / (r2 + lights.radius_m[lamp] ** 2)
         most = 0.0

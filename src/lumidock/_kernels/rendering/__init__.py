@@ -1,0 +1,1 @@
+"""Hot loops of the simulator: rays, surfaces and light on solids."""
