@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lumidock._kernels.rendering import render as kernel
 from lumidock._kernels.rendering.raycast import FAR_M
-from lumidock._kernels.rendering.shading import Lights, Medium, RunDraws
+from lumidock._kernels.rendering.shading import Lights, LitScene, Medium
 from lumidock.camera import Camera
 from lumidock.errors import InputError
 from lumidock.sim.knobs import Output
@@ -57,7 +57,7 @@ def seen(parts, finish, lights, medium=None, half=0.2, blocks=4, middle=(0.0, 0.
     x, y = np.meshgrid(grid + middle[0], grid + middle[1])
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
     sight = kernel.Sight(rays, np.ones(x.shape), np.eye(3), 4.0 * half / blocks, 2.0 * half / side, float(kernel.BLOCK))
-    world = RunDraws(solids, scene.surfaces(), lights, medium or water(), 1e-9,
+    world = LitScene(solids, scene.surfaces(), lights, medium or water(), 1e-9,
                   kernel.no_blockers(len(lights.exponent), len(solids.kind)), np.zeros((2, 2)))  # fmt: skip
     picture = kernel.Picture(
         np.empty((side, side, 3), np.float32), np.empty((side, side), np.float32),

@@ -11,7 +11,7 @@ import numpy as np
 
 from lumidock._kernels.rendering import render as kernel
 from lumidock._kernels.rendering.raycast import FAR_M, Solids
-from lumidock._kernels.rendering.shading import Lights, Medium, RunDraws
+from lumidock._kernels.rendering.shading import Lights, LitScene, Medium
 from lumidock.datatypes import Array
 from lumidock.geometry import se3_inverse, transform_points
 from lumidock.sim import around
@@ -91,7 +91,7 @@ class Painter:
         faint = _FAINT_E / float(gain.max() * self._etendue.max())
         lights = self._lights(view, p_dock, watts)
         blockers = kernel.no_blockers(len(lights.exponent), len(solids.kind))
-        world = RunDraws(solids, scene.surfaces(), lights, self._medium(view), faint, blockers, _NOISE)
+        world = LitScene(solids, scene.surfaces(), lights, self._medium(view), faint, blockers, _NOISE)
         spread = float(np.arccos(np.clip((self._rays[1:, 1:] * self._rays[:-1, :-1]).sum(-1).min(), -1.0, 1.0)))
         step = float(np.sqrt(self._etendue.max())) / self.scale
         sight = kernel.Sight(self._rays, self._etendue, gain, spread, step, float(kernel.BLOCK))

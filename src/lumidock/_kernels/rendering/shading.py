@@ -81,7 +81,7 @@ class Medium(NamedTuple):
     edge_m: Array
 
 
-class RunDraws(NamedTuple):
+class LitScene(NamedTuple):
     """All that a line of sight meets, and the irradiance W/m2 `faint` below which no shadow is looked for.
 
     `blockers` (L, CELLS, S + 1) lists what each lamp has in each direction, `noise` (n, n) are values in [-1, 1) for
@@ -119,7 +119,7 @@ def daylight(medium: Medium, band: int, height_m: float, cosine: float) -> float
 
 @part
 def reflected(
-    world: RunDraws, s: int, face: int, dx: float, dy: float, dz: float, t: float, out: Array, i: int, j: int
+    world: LitScene, s: int, face: int, dx: float, dy: float, dz: float, t: float, out: Array, i: int, j: int
 ) -> None:
     """Put into `out[i, j]` (9,) what leaves a hit at `t` m toward the camera, W/(m2 sr), in each band.
 
@@ -239,7 +239,7 @@ def _stains(noise: Array, x: float, y: float) -> float:
 
 
 @part
-def paint(world: RunDraws, s: int, face: int, x: float, y: float, z: float, footprint_m: float) -> tuple[float, float]:
+def paint(world: LitScene, s: int, face: int, x: float, y: float, z: float, footprint_m: float) -> tuple[float, float]:
     """Share of the pattern's other part at a point of solid `s`, and the factor by which stains change the albedo.
 
     `footprint_m` is the size of a sample there: what is finer is drawn as its mean.

@@ -16,7 +16,7 @@ from lumidock._kernels.rendering.shading import (
     GLOSSY,
     PARTS,
     WATER,
-    RunDraws,
+    LitScene,
     lobe,
     paint,
     reflected,
@@ -133,7 +133,7 @@ def _cast(solids: Solids, spread: float, own: Scratch) -> None:
 
 
 @part
-def _shade(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, i: int, j: int) -> None:
+def _shade(world: LitScene, sight: Sight, place: tuple[int, int], own: Scratch, i: int, j: int) -> None:
     """The light of one sample."""
     what, t = own.what[i, j], own.far[i, j]
     dx, dy, dz = own.rays[i, j]
@@ -166,7 +166,7 @@ def _blended(own: Scratch, top: int, left: int, side: int, i: int, j: int, band:
 
 
 @part
-def _smooth(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, part: tuple[int, int, int]) -> bool:
+def _smooth(world: LitScene, sight: Sight, place: tuple[int, int], own: Scratch, part: tuple[int, int, int]) -> bool:
     """Whether the light in the middle of a part is what its corners say."""
     top, left, side = part
     last = side - 1
@@ -204,13 +204,13 @@ def _flat(solids: Solids, what: int) -> bool:
 
 
 @part
-def _shiny(world: RunDraws, what: int) -> bool:
+def _shiny(world: LitScene, what: int) -> bool:
     k = world.solids.surface[what >> 2]
     return world.surfaces.gloss[k] > 0.0 and world.surfaces.shininess[k] > _SHARP
 
 
 @part
-def _shade_edge(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, top: int, left: int) -> None:
+def _shade_edge(world: LitScene, sight: Sight, place: tuple[int, int], own: Scratch, top: int, left: int) -> None:
     """The light of a small part that shows several surfaces; all samples of a flat one get that of its first."""
     for i in range(top, top + _FINE):
         for j in range(left, left + _FINE):
@@ -228,7 +228,7 @@ def _shade_edge(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scra
 
 
 @part
-def _near_lamp(world: RunDraws, own: Scratch, top: int, left: int, side: int) -> bool:
+def _near_lamp(world: LitScene, own: Scratch, top: int, left: int, side: int) -> bool:
     """Whether a lamp is within twice a part's diagonal of its middle, so that its peak could be missed."""
     last = side - 1
     a, b = own.far[top, left], own.far[top + last, left + last]
@@ -247,7 +247,7 @@ def _near_lamp(world: RunDraws, own: Scratch, top: int, left: int, side: int) ->
 
 
 @part
-def _shade_block(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch) -> None:
+def _shade_block(world: LitScene, sight: Sight, place: tuple[int, int], own: Scratch) -> None:
     """The light of every sample, from the corners of the largest parts in which it changes evenly."""
     own.stack[0, 0], own.stack[0, 1], own.stack[0, 2] = 0, 0, BLOCK
     waiting = 1
@@ -279,7 +279,7 @@ def _shade_block(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scr
 
 
 @part
-def _expose(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch, picture: Picture) -> None:
+def _expose(world: LitScene, sight: Sight, place: tuple[int, int], own: Scratch, picture: Picture) -> None:
     """Write a block's electrons and ranges into the picture."""
     surfaces, gain, cells = world.surfaces, sight.gain, picture.cells
     side = len(picture.electrons) // len(cells)
@@ -312,7 +312,7 @@ def _expose(world: RunDraws, sight: Sight, place: tuple[int, int], own: Scratch,
 
 
 @entry
-def render(world: RunDraws, sight: Sight, own: Scratch, picture: Picture) -> None:
+def render(world: LitScene, sight: Sight, own: Scratch, picture: Picture) -> None:
     """Draw the picture; `world.blockers` is filled first."""
     list_blockers(world.solids, world.lights.p_cam, world.blockers)
     for row in range(len(picture.electrons) // BLOCK):
