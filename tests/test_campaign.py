@@ -159,7 +159,7 @@ def test_a_killed_campaign_goes_on_and_leaves_no_workers(tmp_path):
     assert table["rows"][0]["counts"]["frames"] == 600
 
 
-def test_an_interrupt_ends_the_campaign_without_a_word(tmp_path):
+def test_an_interrupt_ends_the_campaign_and_says_what_is_left(tmp_path):
     words = (
         "campaign",
         "missing-1",
@@ -176,7 +176,9 @@ def test_an_interrupt_ends_the_campaign_without_a_word(tmp_path):
     process = subprocess.Popen([LUMIDOCK, *words, "--out", tmp_path / "out"], **pipes)
     wait_for(lambda: list((tmp_path / "out").glob("shards/*.json")))
     os.killpg(process.pid, signal.SIGINT)
-    assert (*process.communicate(), process.returncode) == (b"", b"", 130)
+    out, err = process.communicate()
+    assert (out, process.returncode) == (b"", 130)
+    assert err.splitlines()[-1].endswith(b"holds the finished shards; the same command continues with the others")
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -117,7 +117,7 @@ def test_what_is_stale_is_not_sent():
 
 
 def test_a_viewer_begins_when_the_vehicle_has_been_told(monkeypatch):
-    monkeypatch.setattr("lumidock.app.serve._AFTER_YOU_S", 0.2)
+    monkeypatch.setattr("lumidock.app.serve._YIELD_S", 0.2)
     began = {}
     workers = [
         Worker(name, lambda name=name: Recorder(lambda _: began.setdefault(name, time.monotonic())), queue=5, **options)

@@ -1,4 +1,4 @@
-"""The words of docs/glossary.md are used, and none of those that they replaced."""
+"""The words of docs/glossary.md are used, and none of those that they replaced, in code, comments and docs."""
 
 import re
 from pathlib import Path
