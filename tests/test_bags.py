@@ -305,6 +305,22 @@ def test_after_a_damaged_chunk_the_rest_is_read(tmp_path, good):
     assert spoilt > 20
 
 
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD, CompressionType.LZ4])
+def test_a_damaged_chunk_costs_its_own_frames_also_without_a_summary(tmp_path, compression):
+    data = chunked([("/front/camera_info", 6, bags.info(6, CAMERA)), *series()], compression)
+    starts, at = [], 8
+    while data[at] != 0x0F:  # the end of the data
+        starts += [at] if data[at] == 0x06 else []
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    path, cut = tmp_path / "cut.mcap", data[:at]
+    for start in starts[3:6:2]:  # the first ones define the channels
+        missing = set()
+        for place in range(start, start + 9 + 40):  # opcode, length, times, size, checksum, compression
+            path.write_bytes(cut[:place] + bytes([cut[place] ^ 0x55]) + cut[place + 1 :])
+            missing |= set(range(6)) - {item.t_ns // SECOND for item in read(path) if isinstance(item, Frame)}
+        assert len(missing) == 1
+
+
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(draw=st.data())
 @pytest.mark.parametrize("kind", bags.KINDS)

@@ -259,6 +259,19 @@ HEAD = """# What is read, and what happens with it
 
 This page is made by `tests/test_formats.py`, which runs every row. `read` says what comes out, `said` what a command
 prints to standard error with it, `refused` the line with which it ends.
+
+**Stamps.** Each topic has one clock: the stamps in its headers or, where the first of them are zero, the times of
+recording; a header that has none among others that do makes a `bad_stamp`. Cameras on the network are stamped by the
+time that they send with their pictures (RTP, and RTCP where that agrees with this machine's clock to a second), so that
+pictures that arrive in bursts keep their distances. `--fps` is for pictures without stamps; where there are stamps they
+hold, but for a video, whose times it replaces, and either is said. `--delay-ms` is taken off every stamp: what passes
+between exposure and stamp. To measure it, let the camera see a screen that shows this machine's time in milliseconds,
+and take the time that can be read in a picture from the picture's stamp; the median of ten pictures will do.
+
+**Calibrations.** What no camera has is refused with its numbers, and taken with `--trust-calibration`: a principal
+point outside the middle half of the picture or at the middle of a picture of another size, a field of view beyond any
+lens, pixels twice as wide as high. `run` and `serve` warn of what `lumidock calib check` warns of. A recording ends
+where its calibration changes, unless `--camera` is given.
 """
 
 

@@ -95,7 +95,8 @@ DelayMs = Annotated[
     typer.Option("--delay-ms", metavar="MS", help="What passes between exposure and stamp; taken off every stamp."),
 ]
 CameraName = Annotated[
-    str | None, typer.Option("--camera-name", metavar="NAME", help="Which camera of a calibration file of several.")
+    str | None,
+    typer.Option("--name", "--camera-name", metavar="NAME", help="Which camera of a calibration file of several."),
 ]
 Fps = Annotated[
     float | None,

@@ -134,7 +134,9 @@ def _read_message(path: Path, content: dict[str, Any]) -> Camera:
         raise InputError(f"{path}: CameraInfo message: wanted 9 numbers of k and 12 of p")
     model = str(content.get("distortion_model", ""))
     x, y, wide, high = window
-    info = CameraInfo(str(path), "", size, model, numbers("d"), k, (), p, binning, (x, y, wide, high))
+    info = CameraInfo(
+        str(path), "", size, model, d=numbers("d"), k=k, r=(), p=p, binning=binning, roi=(x, y, wide, high)
+    )
     return camera_of(info, trusted=True)[0]  # whether it can be a camera's is asked of every calibration alike
 
 

@@ -97,7 +97,7 @@ def read_opencv(path: Path, content: dict[str, Any], name: str | None, size: tup
     named, coefficients = _only(path, "distortions", distortion)
     found_size = _size(path, content) or size
     if found_size is None:
-        raise InputError(f"{path}: says no image size; give --size WIDTHxHEIGHT")
+        raise InputError(f"{path}: says no image size; give --size WIDTHxHEIGHT to `lumidock calib import`")
     model = _model(path, leaves)
     if model == "" and len(coefficients) == 4 and max(map(abs, coefficients[2:])) > _MOST_TANGENTIAL:
         raise InputError(

@@ -97,9 +97,9 @@ def _open_euroc(path: Path, reading: Reading) -> Source:
         "sequence",
         lambda size: _sequence(path / "data", rows, attitudes, reading, size),
         len(rows),
-        camera,
-        station,
-        (table,),
+        camera=camera,
+        station=station,
+        inputs=(table,),
         notes=("read as a camera of EuRoC: stamps from data.csv",),
     )
 

@@ -26,6 +26,9 @@ _MAGIC = b"\x89MCAP0\r\n"
 _ENCODINGS = ("ros1", "cdr", "protobuf")
 _MAX_RECORD = 1 << 28  # a chunk of 256 MiB holds ten raw pictures of 24 megapixels
 _HEAD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
+# opcode and length of a chunk, times of its first and last message, its size and checksum, length of its compression
+_CHUNK = struct.Struct("<BQQQQII")
+_CHUNK_OPCODE, _LONGEST_NAME, _BLOCK = bytes([int(Opcode.CHUNK)]), 8, 1 << 20
 _LAST_OPCODE = int(Opcode.DATA_END)
 _DAMAGED = (McapError, ValueError, EOFError, struct.error, MemoryError, RuntimeError, KeyError, zstandard.ZstdError)
 
@@ -115,22 +118,70 @@ def _count_topics(path: Path, file: BinaryIO) -> list[Topic]:
 
 
 def _walk(path: Path, file: BinaryIO, chunks: list[int], known: _Known) -> Iterator[Message | Broken]:
-    """Record by record; where one makes no sense, on from the next chunk that the summary lists."""
+    """Record by record; where one makes no sense, on from the next chunk, by the summary or else by its looks."""
     size = file.seek(0, 2)
-    at = len(_MAGIC)
+    before, at = 0, len(_MAGIC)
     while at < size:
-        file.seek(at)
-        head = file.read(_HEAD.size)
-        opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
+        opcode, length = _head(file, at)
         if opcode in (Opcode.DATA_END, Opcode.FOOTER):
             return
-        end = at + _HEAD.size + length
-        if 0 < opcode < _LAST_OPCODE and length <= _MAX_RECORD and end <= size:
-            yield from _record(path, at, opcode, file.read(length), known)
-            at = end
-            continue
-        yield Broken(f"{path}: damaged or cut short at byte {at}")
-        at = next((start for start in chunks if start > at), size)
+        end, broken = at + _HEAD.size + length, True
+        if length <= _MAX_RECORD and _is_record(opcode, end, size):
+            broken = False
+            for found in _record(path, at, opcode, file.read(length), known):
+                broken = broken or isinstance(found, Broken)
+                yield found
+        else:
+            yield Broken(f"{path}: damaged or cut short at byte {at}")
+        if broken and not _follows(file, end, size):  # no length can be believed, nor that of the record before
+            end = _resumed(file, chunks, before, at, size)
+        before, at = at, end
+
+
+def _resumed(file: BinaryIO, chunks: list[int], before: int, at: int, size: int) -> int:
+    """Where to read on, by the summary's `chunks` or by looks, after the record at `at`: perhaps short of it."""
+    if chunks:
+        return next((start for start in chunks if start > before and start != at), size)
+    found = _next_chunk(file, before + 1, size)
+    return found if found != at else _next_chunk(file, at + 1, size)
+
+
+def _head(file: BinaryIO, at: int) -> tuple[int, int]:
+    """Opcode and length of the record at byte `at`; zeros at the end of the file."""
+    file.seek(at)
+    head = file.read(_HEAD.size)
+    return _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
+
+
+def _is_record(opcode: int, end: int, size: int) -> bool:
+    """Whether a record that would end at byte `end` can be one of a file of `size` bytes."""
+    return 0 < opcode <= _LAST_OPCODE and end <= size
+
+
+def _follows(file: BinaryIO, at: int, size: int) -> bool:
+    """Whether a record can begin at byte `at`, or the file end there."""
+    if at >= size:
+        return at == size
+    opcode, length = _head(file, at)
+    return _is_record(opcode, at + _HEAD.size + length, size)
+
+
+def _next_chunk(file: BinaryIO, start: int, size: int) -> int:
+    """Where the next chunk begins from `start` on, by what its first fields and the record behind it look like."""
+    while start < size:
+        file.seek(start)
+        block = file.read(_BLOCK + _CHUNK.size)
+        at = block.find(_CHUNK_OPCODE)
+        while 0 <= at < _BLOCK:
+            if len(block) >= at + _CHUNK.size:
+                _, length, first_ns, last_ns, _, _, name = _CHUNK.unpack_from(block, at)
+                end = start + at + _HEAD.size + length
+                sound = first_ns <= last_ns and name <= _LONGEST_NAME and _HEAD.size < length <= _MAX_RECORD
+                if sound and _follows(file, end, size):
+                    return start + at
+            at = block.find(_CHUNK_OPCODE, at + 1)
+        start += _BLOCK
+    return size
 
 
 def _record(path: Path, at: int, opcode: int, body: bytes, known: _Known) -> Iterator[Message | Broken]:

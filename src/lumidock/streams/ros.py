@@ -139,7 +139,7 @@ def _of_ros(message: Message) -> Content:
     if message.type == COMPRESSED:
         return _compressed(stamp_ns, frame_id, str(found.format), data)
     size, order = (int(found.width), int(found.height)), ">" if found.is_bigendian else "<"
-    return Content(stamp_ns, frame_id, "raw", str(found.encoding), data, size, int(found.step), order)
+    return Content(stamp_ns, frame_id, "raw", str(found.encoding), data, size=size, step=int(found.step), order=order)
 
 
 def _of_protobuf(message: Message) -> Content:
@@ -149,7 +149,7 @@ def _of_protobuf(message: Message) -> Content:
         size = protobuf.number(fields, 2), protobuf.number(fields, 3)
         encoding, step = protobuf.content(fields, 4).decode(), protobuf.number(fields, 5)
         data = np.frombuffer(protobuf.content(fields, 6), np.uint8)
-        return Content(stamp_ns, protobuf.content(fields, 7).decode(), "raw", encoding, data, size, step)
+        return Content(stamp_ns, protobuf.content(fields, 7).decode(), "raw", encoding, data, size=size, step=step)
     if message.type == _FOX_COMPRESSED:
         data, form = np.frombuffer(protobuf.content(fields, 2), np.uint8), protobuf.content(fields, 3).decode()
         return _compressed(stamp_ns, protobuf.content(fields, 4).decode(), form, data)
@@ -244,7 +244,8 @@ def _info_of_ros(message: Message) -> CameraInfo:
     binning = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
     roi = int(info.roi.x_offset), int(info.roi.y_offset), int(info.roi.width), int(info.roi.height)
     size, frame_id = (int(info.width), int(info.height)), str(info.header.frame_id)
-    return CameraInfo(message.topic, frame_id, size, str(info.distortion_model), d, k, r, p, binning, roi)
+    lens = str(info.distortion_model)
+    return CameraInfo(message.topic, frame_id, size, lens, d=d, k=k, r=r, p=p, binning=binning, roi=roi)
 
 
 def _info_of_protobuf(message: Message) -> CameraInfo:
@@ -253,7 +254,8 @@ def _info_of_protobuf(message: Message) -> CameraInfo:
     if len(k) not in (0, 9) or len(r) not in (0, 9) or len(p) not in (0, 12):
         raise ValueError("a matrix of another size")
     size, frame_id = (protobuf.number(fields, 2), protobuf.number(fields, 3)), protobuf.content(fields, 9).decode()
-    return CameraInfo(message.topic, frame_id, size, protobuf.content(fields, 4).decode(), d, k, r, p)
+    lens = protobuf.content(fields, 4).decode()
+    return CameraInfo(message.topic, frame_id, size, lens, d=d, k=k, r=r, p=p)
 
 
 def _deserialize(message: Message) -> Any:  # noqa: ANN401  # classes made at run time from message definitions
