@@ -12,14 +12,13 @@ import numpy as np
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Array, Indices
-from lumidock.geometry import se3_exp
 from lumidock.setup.observations import Observations
 
 CALIBRATION = 3  # relative focal error and the shift of the principal point u, v px
 _CAUCHY = 3.0  # sigmas at which a residual counts half; costs 5 % of efficiency on Gaussian noise
 _OUTLIER = 4.0  # sigmas beyond which a detection says nothing; 1 in 3000 by chance in two dimensions
 _MEDIAN_CHI2 = 1.386  # of two degrees of freedom
-_MOST_STEPS, _CONVERGED = 60, 1e-6  # Levenberg-Marquardt; relative fall of the cost
+_MOST_STEPS, _CONVERGED = 60, 1e-5  # Levenberg-Marquardt; relative fall of the cost
 _FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
 _LEAST_NOISE_PX = 0.02  # no detector is better
 _ENOUGH = 60  # residuals of a light from which its own noise is judged; below, that of all lights holds
@@ -99,10 +98,10 @@ def adjust(observed: Observations, camera: Camera, prior: Prior, start: Estimate
     The noise is judged from the residuals, and the adjustment repeated until it stands.
     """
     estimate, noise = start, np.full(len(prior.p_dock), 1.0)
-    for _ in range(4):
+    for _ in range(3):
         estimate = _minimise(observed, camera, prior, estimate, noise)
         now = _noise_of(observed, camera, estimate)
-        settled = np.abs(np.log(now / noise)).max() < 0.02
+        settled = np.abs(np.log(now / noise)).max() < 0.1
         noise = now
         if settled:
             break
@@ -121,14 +120,14 @@ def refine_poses(
         A = np.einsum("fmki,fm,fmkj->fij", line.J_pose, w, line.J_pose)
         a = np.einsum("fmki,fm,fmk->fi", line.J_pose, w, np.nan_to_num(line.residual))
         A += damping[:, None, None] * (np.eye(6) * A + 1e-9 * np.eye(6))
-        step = np.linalg.solve(A, a[..., None])[..., 0]
+        step = (np.linalg.inv(A) @ a[..., None])[..., 0]
         tried = _moved(T, step)
         new = _frame_costs(observed, camera, Estimate(p_dock, tried, np.zeros(CALIBRATION)), sigma_px)
         better = new < cost
         gain = np.where(better, cost - new, 0.0)
         T[better], cost = tried[better], np.where(better, new, cost)
         damping = np.clip(np.where(better, damping / 5.0, damping * 5.0), 1e-9, 1e9)
-        if (gain < 1e-4).all() and (better | (damping > 1.0)).all():
+        if (gain < 1e-2).all() and (better | (damping > 0.1)).all():
             break
     return T, cost
 
@@ -250,7 +249,7 @@ def _of_prior(prior: Prior, at: Estimate) -> tuple[Array, Array]:
 def _stepped(at: Estimate, normal: _Normal, damping: float) -> Estimate:
     """One damped Gauss-Newton step: first what the frames share, then each pose."""
     A = normal.A + damping * np.eye(6) * normal.A + 1e-12 * np.eye(6)
-    AB = np.linalg.solve(A, np.concatenate([normal.B, normal.a[..., None]], axis=2))
+    AB = np.linalg.inv(A) @ np.concatenate([normal.B, normal.a[..., None]], axis=2)
     f, _, s = normal.B.shape
     flat_B, flat_AB = normal.B.reshape(6 * f, s), AB.reshape(6 * f, s + 1)
     reduced = flat_B.T @ flat_AB
@@ -265,8 +264,14 @@ def _stepped(at: Estimate, normal: _Normal, damping: float) -> Estimate:
 
 
 def _moved(T_dock_cam: Array, xi: Array) -> Array:
-    """Poses (F, 4, 4) moved by tangent vectors (F, 6) [m, rad] on the right."""
-    return np.array([T @ se3_exp(x) for T, x in zip(T_dock_cam, xi, strict=True)]).reshape(-1, 4, 4)
+    """Poses (F, 4, 4) moved by (F, 6) [m along the camera's axes, rad]; the rotation by Rodrigues' formula."""
+    out, w = T_dock_cam.copy(), xi[:, 3:]
+    angle = np.sqrt((w**2).sum(axis=1))[:, None, None]
+    K = _skews(w)
+    turn = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * (K @ K)
+    out[:, :3, 3] += (T_dock_cam[:, :3, :3] @ xi[:, :3, None])[..., 0]
+    out[:, :3, :3] = T_dock_cam[:, :3, :3] @ turn
+    return out
 
 
 def _noise_of(observed: Observations, camera: Camera, at: Estimate) -> Array:

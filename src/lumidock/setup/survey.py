@@ -24,7 +24,7 @@ from lumidock.setup.observations import LEAST_LIGHTS, Observations, Progress, id
 from lumidock.station import Station
 
 _ROUNDS = 5  # of association and adjustment; a drawing 10 cm off settles in three
-_MOST_FRAMES = 240  # of one recording; more lengthen a survey and add little, as the camera's errors are shared
+_MOST_FRAMES = 150  # of one recording; more lengthen a survey and add little, as the camera's errors are shared
 _LEAST_FRAMES = 12  # six unknowns a frame: fewer frames leave the lights little more than the drawing says
 _MOST_TILT_RAD = 0.02  # 1 sigma of a frame's tilt; beyond, its flip fits as well and pulls the lights out of plane
 _DECIDED = 9.0  # cost by which the flip of a plane must fit worse: 3 sigmas
