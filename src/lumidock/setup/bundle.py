@@ -14,13 +14,14 @@ from lumidock.camera import Camera
 from lumidock.datatypes import Array, Indices
 from lumidock.setup.observations import Observations
 
-CALIBRATION = 3  # relative focal error and the shift of the principal point u, v px
+CALIBRATION = 5  # relative focal error; shift of the principal point u, v px; radial distortion beyond the file's k1, k2
 _CAUCHY = 3.0  # sigmas at which a residual counts half; costs 5 % of efficiency on Gaussian noise
 _OUTLIER = 4.0  # sigmas beyond which a detection says nothing; 1 in 3000 by chance in two dimensions
 _MEDIAN_CHI2 = 1.386  # of two degrees of freedom
 _MOST_STEPS, _CONVERGED = 60, 1e-5  # Levenberg-Marquardt; relative fall of the cost
+_BELIEVED = 4.0  # sigmas that a calibration may leave its prior
 _FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
-_LEAST_NOISE_PX = 0.02  # no detector is better
+_LEAST_NOISE = 0.1  # of the stated error: no detector is so much better than it says
 _ENOUGH = 60  # residuals of a light from which its own noise is judged; below, that of all lights holds
 
 
@@ -42,6 +43,7 @@ class Prior:
     sigma_m: Array
     sigma_focal: float
     sigma_center_px: float
+    sigma_distortion: float = 0.0
     distances: tuple[Distance, ...] = ()
 
 
@@ -58,17 +60,19 @@ class Estimate:
 class Adjusted:
     """The outcome: the estimate, `covariance` (3M + 3, 3M + 3) of positions and calibration with the poses eliminated.
 
-    `residual_px` (F, M, 2), NaN where unseen; `noise_px` (M,) what each light's centres scatter by; `used` (F, M)
+    `residual_px` (F, M, 2), NaN where unseen; `noise` (M,) by what factor each light's centres scatter
+    more than their stated errors; `used` (F, M)
     the detections that agree; `repeats` how many successive frames carry the information of one, because their errors
-    are alike.
+    are alike; `calibrated`: whether the calibration was adjusted, not kept.
     """
 
     estimate: Estimate
     covariance: Array
     residual_px: Array
-    noise_px: Array
+    noise: Array
     used: np.ndarray
     repeats: float
+    calibrated: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,17 +99,30 @@ class _Normal:
 def adjust(observed: Observations, camera: Camera, prior: Prior, start: Estimate) -> Adjusted:
     """The most probable positions, poses and calibration under a Cauchy loss, from `start`.
 
-    The noise is judged from the residuals, and the adjustment repeated until it stands.
+    The noise is judged from the residuals, and the adjustment repeated until it stands. A calibration that would leave
+    its prior by more than four sigmas stands for an error that this model of the camera does not have: the file's is
+    then kept, and its uncertainty only enters the covariance.
     """
+    found = _settle(observed, camera, prior, start)
+    if np.abs(found.estimate.calibration / _calibration_sigma(prior)).max() <= _BELIEVED:
+        return found
+    kept = replace(found.estimate, calibration=np.zeros(CALIBRATION))
+    return _settle(observed, camera, prior, kept, calibrate=False)
+
+
+def _settle(
+    observed: Observations, camera: Camera, prior: Prior, start: Estimate, *, calibrate: bool = True
+) -> Adjusted:
+    free = prior if calibrate else replace(prior, sigma_focal=0.0, sigma_center_px=0.0, sigma_distortion=0.0)
     estimate, noise = start, np.full(len(prior.p_dock), 1.0)
     for _ in range(3):
-        estimate = _minimise(observed, camera, prior, estimate, noise)
+        estimate = _minimise(observed, camera, free, estimate, noise)
         now = _noise_of(observed, camera, estimate)
         settled = np.abs(np.log(now / noise)).max() < 0.1
         noise = now
         if settled:
             break
-    return _conclude(observed, camera, prior, estimate, noise)
+    return _conclude(observed, camera, prior, estimate, noise, calibrate=calibrate)
 
 
 def refine_poses(
@@ -157,15 +174,21 @@ def _linearised(observed: Observations, camera: Camera, at: Estimate) -> _Linear
     f, m = p_cam.shape[:2]
     with np.errstate(all="ignore"):  # a light behind the camera is a NaN, which does not count
         uv, J_uv_p = camera.project_with_jacobian(p_cam.reshape(-1, 3))
-    scale = 1.0 + at.calibration[0]
     from_center = (uv - camera.center_px).reshape(f, m, 2)
-    expected = from_center * scale + camera.center_px + at.calibration[1:]
-    J = (J_uv_p * scale).reshape(f, m, 2, 3)
+    x = from_center / camera.focal_px
+    r2 = (x * x).sum(axis=2)[..., None]
+    focal, k1, k2 = at.calibration[[0, 3, 4]]
+    scale = 1.0 + focal + k1 * r2 + k2 * r2 * r2
+    expected = from_center * scale + camera.center_px + at.calibration[1:3]
+    stretch = scale[..., None] * np.eye(2)
+    stretch = stretch + 2.0 * (k1 + 2.0 * k2 * r2)[..., None] * from_center[..., :, None] * (x / camera.focal_px)[..., None, :]
+    J = stretch @ J_uv_p.reshape(f, m, 2, 3)
     residual = observed.uv - expected
     good = np.isfinite(residual).all(axis=2)
     J = np.where(good[..., None, None], J, 0.0)
     J_calibration = np.zeros((f, m, 2, CALIBRATION))
-    J_calibration[..., 0] = np.where(good[..., None], from_center, 0.0)
+    for column, factor in ((0, 1.0), (3, r2), (4, r2 * r2)):
+        J_calibration[..., column] = np.where(good[..., None], from_center * factor, 0.0)
     J_calibration[..., 0, 1] = J_calibration[..., 1, 2] = good
     J_pose = np.concatenate([-J, J @ _skews(p_cam)], axis=3)
     return _Linear(np.where(good[..., None], residual, np.nan), J_pose, J @ R_dock_cam.swapaxes(1, 2)[:, None], J_calibration)
@@ -200,7 +223,8 @@ def _cost(observed: Observations, camera: Camera, prior: Prior, at: Estimate, si
 
 
 def _calibration_sigma(prior: Prior) -> Array:
-    return np.maximum([prior.sigma_focal, prior.sigma_center_px, prior.sigma_center_px], 1e-9)
+    center, bent = prior.sigma_center_px, prior.sigma_distortion
+    return np.maximum([prior.sigma_focal, center, center, bent, bent], 1e-9)
 
 
 def _length(p_dock: Array, tape: Distance) -> float:
@@ -283,10 +307,12 @@ def _noise_of(observed: Observations, camera: Camera, at: Estimate) -> Array:
     noise = np.full(r2.shape[1], everyone)
     for light in np.flatnonzero(np.isfinite(r2).sum(axis=0) >= _ENOUGH):
         noise[light] = np.sqrt(np.nanmedian(r2[:, light]) / _MEDIAN_CHI2) / share
-    return np.maximum(noise, np.maximum(_LEAST_NOISE_PX, 0.3 * everyone))
+    return np.maximum(noise, np.maximum(_LEAST_NOISE, 0.3 * everyone))
 
 
-def _conclude(observed: Observations, camera: Camera, prior: Prior, at: Estimate, noise: Array) -> Adjusted:
+def _conclude(
+    observed: Observations, camera: Camera, prior: Prior, at: Estimate, noise: Array, *, calibrate: bool
+) -> Adjusted:
     """Covariance by the detections that agree, each worth `repeats` times less than if errors were independent."""
     line = _linearised(observed, camera, at)
     sigma = observed.sigma_px * noise
@@ -296,9 +322,24 @@ def _conclude(observed: Observations, camera: Camera, prior: Prior, at: Estimate
     repeats = _repeats(observed, line.residual / sigma[..., None], used) * spread
     normal = _normal(line, prior, at, sigma, used / (sigma**2 * repeats))
     f, _, s = normal.B.shape
-    AB = np.linalg.solve(normal.A + 1e-12 * np.eye(6), normal.B)
+    AB = np.linalg.inv(normal.A + 1e-12 * np.eye(6)) @ normal.B
     S = normal.C - normal.B.reshape(6 * f, s).T @ AB.reshape(6 * f, s)
-    return Adjusted(at, np.linalg.inv(0.5 * (S + S.T)), line.residual, noise, used, repeats)
+    S = 0.5 * (S + S.T)
+    covariance = np.linalg.inv(S) if calibrate else _considered(S, _calibration_sigma(prior))
+    return Adjusted(at, covariance, line.residual, noise, used, repeats, calibrate)
+
+
+def _considered(S: Array, calibration_sigma: Array) -> Array:
+    """Covariance where the calibration was kept as it was, with its error carried into the positions.
+
+    Source: S. F. Schmidt, 1966 (consider parameters).
+    """
+    n = len(S) - CALIBRATION
+    positions = np.linalg.inv(S[:n, :n])
+    carried = -positions @ S[:n, n:]
+    C = np.diag(calibration_sigma**2)
+    top = np.concatenate([positions + carried @ C @ carried.T, carried @ C], axis=1)
+    return np.concatenate([top, np.concatenate([C @ carried.T, C], axis=1)])
 
 
 def _expected_chi2(used: np.ndarray) -> float:

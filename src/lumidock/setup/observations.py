@@ -22,8 +22,8 @@ Progress = Callable[[int, int | None], None]
 class Observations:
     """Identified lights in F frames; M lights.
 
-    `uv` (F, M, 2) px, NaN where a light was not detected; `sigma_px` (F, M) the detector's own 1-sigma of each centre,
-    1 where it gives none; `recording` (F,) and `t_ns` (F,) say when; `frame` (F,) are the names of the frames.
+    `uv` (F, M, 2) px, NaN where a light was not detected; `sigma_px` (F, M) the 1-sigma error of each centre as the
+    detector states it, or as configured where it states none; `recording` (F,) and `t_ns` (F,) say when; `frame` (F,) are the names of the frames.
     """
 
     uv: Array
@@ -72,7 +72,7 @@ def identify(
     for number, recording in enumerate(recordings):
         localizer = Localizer(station, camera, config)
         for detections in recording:
-            rows.append(_row(number, localizer.process_detections(detections), len(station)))
+            rows.append(_row(number, localizer.process_detections(detections), len(station), config.match.noise_px))
             done += 1
             if progress is not None:
                 progress(done, None)
@@ -98,12 +98,12 @@ class _Row:
     frame: str
 
 
-def _row(recording: int, fix: Fix, m: int) -> _Row | None:
+def _row(recording: int, fix: Fix, m: int, noise_px: float) -> _Row | None:
     if fix.match is None or (fix.match.light >= 0).sum() < LEAST_LIGHTS:
         return None
     light, d = fix.match.light, fix.match.detections
     used = light >= 0
-    uv, sigma = np.full((m, 2), np.nan), np.ones(m)
+    uv, sigma = np.full((m, 2), np.nan), np.full(m, noise_px)
     uv[light[used]] = d.uv[used]
     if d.cov_px2 is not None:
         sigma[light[used]] = np.sqrt(0.5 * np.trace(d.cov_px2[used], axis1=1, axis2=2))

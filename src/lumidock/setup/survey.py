@@ -29,7 +29,7 @@ _LEAST_FRAMES = 12  # six unknowns a frame: fewer frames leave the lights little
 _MOST_TILT_RAD = 0.02  # 1 sigma of a frame's tilt; beyond, its flip fits as well and pulls the lights out of plane
 _DECIDED = 9.0  # cost by which the flip of a plane must fit worse: 3 sigmas
 _LEAST_SIGMA_M = 0.0005  # a lamp's optical centre is not known better than this
-_SETTLED = 0.1  # of a light's sigma: smaller moves change nothing
+_SETTLED = 0.2  # of a light's sigma: smaller moves change nothing
 _WEAK = 0.7  # of the sigma before: what remains of it after the survey was not observed
 _MOST_NOISE_PX = 1.5  # three times the detector's usual error: more, and the dock is another or the lights are mixed up
 _MOST_MOVED = 4.0  # rms move in sigmas of the drawing beyond which its sigmas are not honest
@@ -111,7 +111,7 @@ def prior_of(
         np.maximum(sigma, _LEAST_SIGMA_M),
         drawing.sigma_focal,
         drawing.sigma_center_px,
-        tuple(distances),
+        distances=tuple(distances),
     )
 
 
@@ -265,8 +265,13 @@ def _unobserved(
             f"the size of the whole: {100 * scale[0]:.2f} % (1 sigma), from the drawing alone; "
             "tape one distance between two lights far apart and give it with --distance"
         )
+    if not adjusted.calibrated:
+        said.append(
+            "the camera: the frames ask for a calibration more than four sigmas from the file's, so the file's was"
+            " kept; calibrate anew in water (lumidock calib water), then survey again"
+        )
     focal = float(np.sqrt(adjusted.covariance[-CALIBRATION, -CALIBRATION]))
-    if focal > _WEAK * prior.sigma_focal:
+    if adjusted.calibrated and focal > _WEAK * prior.sigma_focal:
         said.append(
             f"the focal length: {100 * focal:.2f} % (1 sigma) as before; it trades with the distance between layers"
         )
