@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lumidock.datatypes import Attitude, Detections, Fix, Frame, Guide, Match, Protection, require_shape
+from lumidock.errors import DataError
 
 THREE = Detections.from_uv("a.png", 5, np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))
 T = np.eye(4)
@@ -52,11 +53,30 @@ def test_an_encoding_that_does_not_fit_is_refused(shape, dtype, encoding):
         (np.zeros(4, np.uint8), "image has shape"),
         (np.zeros((4, 6, 1), np.uint8), "image has shape"),
         (np.zeros((4, 6, 4), np.uint8), "image has shape"),
+        (np.zeros((0, 6), np.uint8), "image has shape"),
+        (None, "image is None, wanted an array .*was the file read"),
+        ([[1, 2], [3, 4]], "image is of type list"),
     ],
 )
 def test_another_image_is_refused(image, match):
-    with pytest.raises(ValueError, match=match):
+    with pytest.raises(DataError, match=match):
         Frame("a.png", 0, image)
+
+
+@pytest.mark.parametrize("t_ns", [1.5, 1.7e9, None, "5", True, np.float64(3)])
+def test_a_stamp_that_is_no_integer_is_refused(t_ns):
+    with pytest.raises(DataError, match="wanted an integer of nanoseconds"):
+        Frame("a.png", t_ns, np.zeros((4, 6), np.uint8))
+    with pytest.raises(DataError, match="wanted an integer of nanoseconds"):
+        Detections.from_uv("a.png", t_ns, THREE.uv)
+
+
+@pytest.mark.parametrize(
+    "uv", [None, np.zeros(4), np.zeros((3, 3)), np.zeros((2, 3, 2)), [["a", "b"]], [[1.0, np.nan]], [[1.0], [1.0, 2.0]]]
+)
+def test_centroids_of_another_shape_are_refused_not_reshaped(uv):
+    with pytest.raises(DataError, match="uv"):
+        Detections.from_uv("a.png", 5, uv)
 
 
 def test_detections_from_uv_know_only_their_places():
@@ -97,11 +117,11 @@ def test_an_attitude_is_a_rotation_with_an_error(R, sigma_rad, match):
 
 
 @pytest.mark.parametrize("light", [[0, 1, 2], [7, -1, -1], [-1, -1, -1]])
-def test_a_match_names_each_light_once(light):
+def test_a_match_identifies_each_light_once(light):
     assert Match(THREE, np.array(light)).light.tolist() == light
 
 
-@pytest.mark.parametrize(("light", "match"), [([0, 1, 0], "named twice"), ([0, 1], "has shape")])
+@pytest.mark.parametrize(("light", "match"), [([0, 1, 0], "assigned to the same light"), ([0, 1], "has shape")])
 def test_another_match_is_refused(light, match):
     with pytest.raises(ValueError, match=match):
         Match(THREE, np.array(light))

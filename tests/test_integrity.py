@@ -13,7 +13,8 @@ from lumidock.config import Config, IntegrityConfig
 from lumidock.datatypes import Guide, Protection
 from lumidock.evaluation import claims
 from lumidock.geometry import bearing_and_range, se3_exp, se3_inverse
-from lumidock.integrity import Bounds, alert_limit, alert_limits, bounds, guide_holds, pose_holds, sigma_factors
+from lumidock.alert_limits import DEFAULT_ALERT_LIMITS
+from lumidock.integrity import Bounds, bounds, guide_holds, pose_holds, sigma_factors
 from lumidock.station import load_station
 from lumidock.track import NO_PLANE, Track
 
@@ -66,28 +67,6 @@ def sizes(T_dock_cam, truth):
 def levels_of(bound):
     p, g = bound.protection, bound.guide
     return np.array([p.lateral_m, p.axial_m, p.angle_rad, g.pl_bearing_rad, g.pl_range_m])
-
-
-@pytest.mark.parametrize(
-    ("z_m", "limit_m", "limit_deg"),
-    [(-3, 0.3, 5), (1.49, 0.3, 5), (1.5, 0.5, 5), (4.99, 0.5, 5), (5, 1, 8), (11.99, 1, 8), (12, 1.2, 10), (30, 3, 10)],
-)
-def test_alert_limit_is_the_contracts(z_m, limit_m, limit_deg):
-    assert_close(alert_limit(z_m, 0.0), (limit_m, math.radians(limit_deg)))
-
-
-def test_alert_limits_are_the_same_one_by_one_and_rise_with_distance(rng):
-    z, axial = rng.uniform(-4, 35, 500), rng.exponential(0.5, 500)
-    metres, angle = alert_limits(z, axial)
-    assert_close(np.array([alert_limit(a, b) for a, b in zip(z, axial, strict=True)]), np.stack([metres, angle], 1))
-    order = np.argsort(z - axial)
-    assert (np.diff(metres[order]) >= 0).all()
-    assert (np.diff(angle[order]) >= 0).all()
-    # the strictest limit anywhere in z +- pl
-    inside = z[:, None] + axial[:, None] * np.linspace(-1, 1, 21)
-    strictest, least = alert_limits(inside, np.zeros_like(inside))
-    assert_close(strictest.min(axis=1), metres)
-    assert_close(least.min(axis=1), angle)
 
 
 @pytest.mark.parametrize("risk", [0.5, 0.05, 1e-3, 1e-6, 1e-9])
@@ -174,8 +153,8 @@ def test_a_light_that_cannot_be_left_out_leaves_no_level(rng):
     apart[1, 9:] = np.inf
     bound = bounds([belief(at(8.0, rng), covariance(rng), lights=7, apart=apart)], IntegrityConfig())
     assert np.isinf(levels_of(bound)).all()
-    assert not pose_holds(bound)
-    assert not guide_holds(bound)
+    assert not pose_holds(bound, DEFAULT_ALERT_LIMITS)
+    assert not guide_holds(bound, DEFAULT_ALERT_LIMITS)
 
 
 def bound_of(z, lateral=0.01, axial=0.01, angle=0.01, bearing=0.001, distance=0.01, *, x=0.0):
@@ -187,31 +166,31 @@ def bound_of(z, lateral=0.01, axial=0.01, angle=0.01, bearing=0.001, distance=0.
 
 @pytest.mark.parametrize("z_m", [0.5, 2.0, 6.0, 20.0])
 def test_a_pose_holds_only_inside_all_its_limits(z_m):
-    limit_m, limit_rad = alert_limit(z_m, 0.0)
-    assert pose_holds(bound_of(z_m))
-    assert not pose_holds(bound_of(z_m, lateral=limit_m))
-    assert not pose_holds(bound_of(z_m, axial=1.01 * limit_m))
-    assert not pose_holds(bound_of(z_m, angle=limit_rad))
-    assert not pose_holds(bound_of(z_m, axial=math.nan))
-    assert not pose_holds(bound_of(z_m, angle=math.inf))
+    limit_m, _, limit_rad = DEFAULT_ALERT_LIMITS.of_pose(z_m, 0.0)
+    assert pose_holds(bound_of(z_m), DEFAULT_ALERT_LIMITS)
+    assert not pose_holds(bound_of(z_m, lateral=limit_m), DEFAULT_ALERT_LIMITS)
+    assert not pose_holds(bound_of(z_m, axial=1.01 * limit_m), DEFAULT_ALERT_LIMITS)
+    assert not pose_holds(bound_of(z_m, angle=limit_rad), DEFAULT_ALERT_LIMITS)
+    assert not pose_holds(bound_of(z_m, axial=math.nan), DEFAULT_ALERT_LIMITS)
+    assert not pose_holds(bound_of(z_m, angle=math.inf), DEFAULT_ALERT_LIMITS)
 
 
 def test_a_guide_from_afar_has_its_own_limits():
-    assert guide_holds(bound_of(20.0, lateral=9.0, axial=9.0, angle=9.0))
-    assert guide_holds(bound_of(20.0, bearing=0.99 * math.radians(1.5), distance=1.8))
-    assert not guide_holds(bound_of(20.0, bearing=math.radians(1.5)))
-    assert not guide_holds(bound_of(20.0, distance=1.82))  # a tenth of the near end, 18.18 m
-    assert not guide_holds(bound_of(20.0, bearing=math.nan))
-    assert guide_holds(bound_of(3.2, distance=0.15))
+    assert guide_holds(bound_of(20.0, lateral=9.0, axial=9.0, angle=9.0), DEFAULT_ALERT_LIMITS)
+    assert guide_holds(bound_of(20.0, bearing=0.99 * math.radians(1.5), distance=1.8), DEFAULT_ALERT_LIMITS)
+    assert not guide_holds(bound_of(20.0, bearing=math.radians(1.5)), DEFAULT_ALERT_LIMITS)
+    assert not guide_holds(bound_of(20.0, distance=1.82), DEFAULT_ALERT_LIMITS)  # a tenth of the near end, 18.18 m
+    assert not guide_holds(bound_of(20.0, bearing=math.nan), DEFAULT_ALERT_LIMITS)
+    assert guide_holds(bound_of(3.2, distance=0.15), DEFAULT_ALERT_LIMITS)
 
 
 @pytest.mark.parametrize("angle", [0.01, 0.2])
 @pytest.mark.parametrize("z_m", [-2.5, 0.1, 1.0, 2.9])
 def test_a_guide_near_the_dock_holds_as_the_pose_does(z_m, angle):
     bound = bound_of(z_m, angle=angle, bearing=9.0, distance=0.0)
-    assert guide_holds(bound) == pose_holds(bound) == (angle < math.radians(5))
+    assert guide_holds(bound, DEFAULT_ALERT_LIMITS) == pose_holds(bound, DEFAULT_ALERT_LIMITS) == (angle < math.radians(5))
     # a far guide whose range may end near the dock is near
-    assert guide_holds(bound_of(3.5, angle=angle, distance=0.6)) == (angle < math.radians(5))
+    assert guide_holds(bound_of(3.5, angle=angle, distance=0.6), DEFAULT_ALERT_LIMITS) == (angle < math.radians(5))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from lumidock.config import Config
 from lumidock.datatypes import Attitude, Detections, Frame
 from lumidock.errors import FrameError, InputError
 from lumidock.evaluation import claims
-from lumidock.integrity import alert_limit
 from lumidock.localizer import Localizer
 from lumidock.pose import project_lights
 from lumidock.sim.detections import simulated_frames
@@ -60,7 +59,7 @@ def require_sound(fix):
         assert np.isfinite(fix.T_dock_cam).all()
         assert np.isfinite(fix.covariance).all()
         assert np.linalg.eigvalsh(fix.covariance)[0] > 0.0
-        limit_m, limit_rad = alert_limit(fix.T_dock_cam[2, 3], p.axial_m)
+        limit_m, _, limit_rad = STATION.alert_limits.of_pose(fix.T_dock_cam[2, 3], p.axial_m)
         assert max(p.lateral_m, p.axial_m) < limit_m
         assert p.angle_rad < limit_rad
         assert fix.status != "none"

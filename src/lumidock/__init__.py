@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from lumidock.camera import Camera, load_camera
     from lumidock.config import Config, PaperConfig, load_config
     from lumidock.datatypes import Attitude, Detections, Fix, Frame, Guide, LayerPose, Match, Protection
-    from lumidock.errors import FrameError, InputError, LumidockError
+    from lumidock.errors import DataError, FrameError, InputError, LumidockError
     from lumidock.localizer import Localizer
     from lumidock.paper import PaperLocalizer
     from lumidock.pose import PoseSolution, solve_pose
@@ -20,6 +20,7 @@ __all__ = [
     "Attitude",
     "Camera",
     "Config",
+    "DataError",
     "Detections",
     "Fix",
     "Frame",
@@ -45,7 +46,7 @@ _HOMES = {
     "camera": ("Camera", "load_camera"),
     "config": ("Config", "PaperConfig", "load_config"),
     "datatypes": ("Attitude", "Detections", "Fix", "Frame", "Guide", "LayerPose", "Match", "Protection"),
-    "errors": ("FrameError", "InputError", "LumidockError"),
+    "errors": ("DataError", "FrameError", "InputError", "LumidockError"),
     "localizer": ("Localizer",),
     "paper": ("PaperLocalizer",),
     "pose": ("PoseSolution", "solve_pose"),

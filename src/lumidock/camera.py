@@ -283,12 +283,12 @@ class _CameraInfo(BaseModel):
     distortion_coefficients: _Matrix
 
 
-def load_camera(path: Path) -> Camera:
+def load_camera(path: Path | str) -> Camera:
     """Read a ROS camera_info YAML file.
 
     Raises: InputError, one line, for what is missing, not finite, of the wrong length or not supported.
     """
-    info = validate(_CameraInfo, read_mapping(path), str(path))
+    info = validate(_CameraInfo, read_mapping(Path(path), "camera"), str(path))
     size = info.image_width, info.image_height
     return camera_from(
         str(path), size, info.camera_matrix.data, info.distortion_model, info.distortion_coefficients.data

@@ -267,6 +267,6 @@ class Config(Section):
     label: LabelConfig = LabelConfig()
 
 
-def load_config(path: Path) -> Config:
+def load_config(path: Path | str) -> Config:
     """Read a configuration file; what it does not name keeps its default. Raises: InputError, one line."""
-    return validate(Config, read_mapping(path), str(path))
+    return validate(Config, read_mapping(Path(path), "configuration"), str(path))

@@ -9,6 +9,8 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from lumidock.errors import DataError
+
 Array = NDArray[np.floating[Any]]
 Image = NDArray[Any]  # uint8 or uint16
 Indices = NDArray[np.int64]
@@ -23,13 +25,31 @@ MatchSource = Literal["pso", "btekf"]
 def require_shape(name: str, array: np.ndarray, *shape: int | None) -> None:
     """Check an array's shape; `None` stands for any length.
 
-    Raises: ValueError naming the array and both shapes.
+    Raises: DataError naming the array and both shapes.
     """
-    have = array.shape
+    have = getattr(array, "shape", None)
     if have == shape:
         return
+    if have is None:
+        raise DataError(f"{name} is {_type_of(array)}, wanted an array of shape {_shape_text(shape)}")
     if len(have) != len(shape) or any(want not in (None, n) for n, want in zip(have, shape, strict=True)):
-        raise ValueError(f"{name} has shape {array.shape}, wanted {shape}")
+        raise DataError(f"{name} has shape {have}, wanted {_shape_text(shape)}")
+
+
+def _shape_text(shape: tuple[int | None, ...]) -> str:
+    """A shape as the docstrings write it, N for any length."""
+    lengths = ["N" if length is None else str(length) for length in shape]
+    return f"({', '.join(lengths)}{',' * (len(shape) == 1)})"
+
+
+def _type_of(value: object) -> str:
+    return "None" if value is None else f"of type {type(value).__name__}"
+
+
+def require_stamp(t_ns: object) -> None:
+    """Raises: DataError for a stamp that is no integer of nanoseconds, such as seconds as a float."""
+    if not isinstance(t_ns, int | np.integer) or isinstance(t_ns, bool):
+        raise DataError(f"t_ns is {t_ns!r}, {_type_of(t_ns)}, wanted an integer of nanoseconds")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,12 +62,12 @@ class Attitude:
     def __post_init__(self) -> None:
         require_shape("R_dock_cam", self.R_dock_cam, 3, 3)
         if not (np.isfinite(self.R_dock_cam).all() and 0.0 < self.sigma_rad < np.inf):
-            raise ValueError("an attitude needs a finite rotation and a positive sigma_rad")
+            raise DataError("an attitude needs a finite rotation and a positive sigma_rad")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One picture as the camera gives it, exposed at `t_ns`; `name` as its source calls it.
+    """One image as the camera gives it, exposed at `t_ns`; `name` as its source calls it.
 
     `image` (H, W) mono or raw mosaic, or (H, W, 3) BGR, of 8 or 16 bits; 16 bits use their full scale. `encoding` as
     ROS calls it; empty for mono or BGR by shape, `bayer_rggb8`, `bayer_grbg16` and so on for a mosaic, whose letters
@@ -61,22 +81,27 @@ class Frame:
     encoding: str = ""
 
     def __post_init__(self) -> None:
+        require_stamp(self.t_ns)
+        if not isinstance(self.image, np.ndarray):
+            why = ": was the file read?" if self.image is None else ""  # what cv2.imread gives for a missing file
+            raise DataError(f"image is {_type_of(self.image)}, wanted an array (H, W) or (H, W, 3){why}")
         if self.image.dtype not in (np.uint8, np.uint16):
-            raise ValueError(f"image is {self.image.dtype}, wanted uint8 or uint16")
-        require_shape("image", self.image, *((None, None) if self.image.ndim == 2 else (None, None, 3)))
+            raise DataError(f"image is {self.image.dtype}, wanted uint8 or uint16")
+        if self.image.ndim < 2 or self.image.shape[2:] not in ((), (3,)) or not self.image.size:
+            raise DataError(f"image has shape {self.image.shape}, wanted (H, W) or (H, W, 3)")
         bits = 8 * self.image.dtype.itemsize
         fitting = [f"mono{bits}", *(f"{order}{bits}" for order in MOSAICS)] if self.image.ndim == 2 else [f"bgr{bits}"]
         if self.encoding and self.encoding not in fitting:
-            raise ValueError(f"encoding {self.encoding!r} does not fit, wanted one of {', '.join(fitting)}")
+            raise DataError(f"encoding {self.encoding!r} does not fit, wanted one of {', '.join(fitting)}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
-    """The N spots found in one frame.
+    """The N detections of one frame: blobs in the image that may be lights of the dock.
 
-    `uv` (N, 2) px; `radius_px` (N,) equal-area radius at half peak; `flux` (N,) grey levels summed over the spot;
-    `p_light` (N,) probability of being a lamp; `p_rear` (N,) probability of belonging to the rear layer, NaN where
-    nothing is known; `cov_px2` (N, 2, 2) covariance of the centres, None where the detector gives none.
+    `uv` (N, 2) centroids px; `radius_px` (N,) equal-area radius at half peak; `flux` (N,) grey levels summed over the
+    blob; `p_light` (N,) probability of being a lamp; `p_rear` (N,) probability of belonging to the rear layer, NaN
+    where nothing is known; `cov_px2` (N, 2, 2) covariance of the centroids, None where the detector gives none.
     """
 
     frame: str
@@ -90,9 +115,10 @@ class Detections:
     attitude: Attitude | None = None
 
     def __post_init__(self) -> None:
+        require_stamp(self.t_ns)
         require_shape("uv", self.uv, None, 2)
         if not np.isfinite(self.uv).all():
-            raise ValueError("uv is not finite")
+            raise DataError("uv is not finite")
         n = len(self.uv)
         require_shape("radius_px", self.radius_px, n)
         require_shape("flux", self.flux, n)
@@ -106,10 +132,19 @@ class Detections:
 
     @classmethod
     def from_uv(cls, frame: str, t_ns: int, uv: Array, *, p_rear: Array | None = None) -> Self:
-        """Make detections of which only the centres `uv` (N, 2) px, and perhaps `p_rear` (N,), are known."""
-        unknown = np.full(len(uv), np.nan)
-        p_rear = unknown if p_rear is None else p_rear
-        return cls(frame, t_ns, np.asarray(uv, float).reshape(-1, 2), unknown, unknown, np.ones(len(uv)), p_rear)
+        """Make detections of which only the centroids `uv` (N, 2) px, and perhaps `p_rear` (N,), are known.
+
+        Raises: DataError for another shape, a number that is not finite, or a stamp that is no integer.
+        """
+        try:
+            centroids = np.asarray(uv, float)
+        except (TypeError, ValueError):
+            raise DataError("uv holds no numbers, wanted an array of shape (N, 2)") from None
+        centroids = centroids.reshape(-1, 2) if centroids.shape == (0,) else centroids
+        require_shape("uv", centroids, None, 2)
+        n = len(centroids)
+        unknown = np.full(n, np.nan)
+        return cls(frame, t_ns, centroids, unknown, unknown, np.ones(n), unknown if p_rear is None else p_rear)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,14 +166,14 @@ class Match:
 
     def __post_init__(self) -> None:
         require_shape("light", self.light, len(self.detections))
-        named = [light for light in self.light.tolist() if light >= 0]
-        if len(set(named)) != len(named):
-            raise ValueError("a light is named twice in one match")
+        identified = [light for light in self.light.tolist() if light >= 0]
+        if len(set(identified)) != len(identified):
+            raise DataError("two detections are assigned to the same light")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LayerPose:
-    """The pose `T_dock_cam` (4, 4) that one layer alone gave in one frame, and which step named its lights."""
+    """The pose `T_dock_cam` (4, 4) that one layer alone gave in one frame; `source` is the step that matched it."""
 
     layer: str
     T_dock_cam: Array
@@ -148,7 +183,10 @@ class LayerPose:
 
 @dataclass(frozen=True, slots=True)
 class Protection:
-    """What the error of a pose exceeds once in 1e6 frames: hypot(ex, ey), |ez| and total rotation."""
+    """Protection levels of a pose: its error exceeds each of them at most once in a million frames.
+
+    `lateral_m` bounds hypot(ex, ey), `axial_m` |ez|, `angle_rad` the total rotation error.
+    """
 
     lateral_m: float
     axial_m: float
@@ -157,7 +195,7 @@ class Protection:
 
 @dataclass(frozen=True, slots=True)
 class Guide:
-    """Bearings atan2(x, z), atan2(y, z) and distance of the dock's origin in `cam`, with their protection levels."""
+    """Bearings atan2(x, z) and atan2(y, z) and distance of the dock's origin in `cam`, with their protection levels."""
 
     bearing_x_rad: float
     bearing_y_rad: float
@@ -174,7 +212,7 @@ class Fix:
     from a method that knows them. `guide` is there when bearing and range may be used. `nis` is the normalised
     innovation squared of a tracked frame over its degrees of freedom, 1 on average where noise is as stated; NaN
     without history. `n_seen` counts the frame's detections and `n_used` those behind the pose; `by_layer` holds what
-    each layer said alone, where a method works by layer.
+    each layer's lights give alone, where a method works by layer.
     """
 
     frame: str
@@ -194,16 +232,16 @@ class Fix:
 
     def __post_init__(self) -> None:
         if (self.T_dock_cam is None) != bool(self.reason):
-            raise ValueError("a fix holds either a pose or the reason why there is none")
+            raise DataError("a fix holds either a pose or the reason why there is none")
         if self.T_dock_cam is None:
             if self.covariance is not None or self.protection is not None:
-                raise ValueError("without a pose there is neither a covariance nor a protection level")
+                raise DataError("without a pose there is neither a covariance nor a protection level")
             return
         require_shape("T_dock_cam", self.T_dock_cam, 4, 4)
         if self.covariance is not None:
             require_shape("covariance", self.covariance, 6, 6)
         if not np.isfinite(self.T_dock_cam).all():
-            raise ValueError("T_dock_cam is not finite")
+            raise DataError("T_dock_cam is not finite")
 
     @property
     def valid(self) -> bool:

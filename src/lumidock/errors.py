@@ -14,6 +14,10 @@ class InputError(LumidockError):
     """A file, folder or option that cannot be used at all."""
 
 
+class DataError(LumidockError, ValueError):
+    """A value handed to the library that cannot be what its argument stands for: its type, its shape or its range."""
+
+
 class FrameError(LumidockError):
     """One frame that cannot be used; `reason` is the fixed word for the `reason` column."""
 

@@ -1,4 +1,4 @@
-"""May a pose be used: protection levels, alert limits, the two levels of trust and the docking stage."""
+"""May a pose be used: protection levels against the alert limits, and the docking stage."""
 
 from __future__ import annotations
 
@@ -10,40 +10,15 @@ from functools import cache
 import numpy as np
 
 from lumidock._kernels.tracking.levels import levels
+from lumidock.alert_limits import AlertLimits
 from lumidock.config import IntegrityConfig
 from lumidock.datatypes import Array, Guide, Protection, Stage
 from lumidock.match import Plan
 from lumidock.track import Track
 
-# default alert limits: below this z m, metres for the lateral and the axial error each, degrees of rotation
-_NEAR_LIMITS = ((1.5, 0.3, 5.0), (5.0, 0.5, 5.0), (12.0, 1.0, 8.0))
-_FAR_SHARE, _FAR_DEG = 0.10, 10.0  # beyond: a share of z, and degrees
-GUIDE_BEARING_RAD, GUIDE_RANGE_M, GUIDE_RANGE_SHARE = math.radians(1.5), 0.3, 0.10
 _ANY_BEARING = math.sqrt(2.0) * math.pi  # at the origin itself a bearing says nothing ...
 _CLEAR, _STEEP = 2.0, 0.3  # ... which begins so many range levels away, or with a bearing level of so many rad
 _IDENTITY = np.eye(4)
-GUIDE_FROM_M = 3.0  # nearer to the dock's origin, or past it, bearing and range say nothing and the pose decides
-
-
-def alert_limits(z_m: Array, pl_axial_m: Array) -> tuple[Array, Array]:
-    """Alert limits (m for lateral and axial error each, rad for the total rotation) at estimated z m.
-
-    The strictest limit over z +- `pl_axial_m`; limits rise with z, so it is the one at the near end. Arrays broadcast.
-    """
-    z = np.asarray(z_m) - np.asarray(pl_axial_m)
-    metres, degrees = _FAR_SHARE * z, np.full_like(z, _FAR_DEG)
-    for below, limit_m, limit_deg in reversed(_NEAR_LIMITS):
-        metres, degrees = np.where(z < below, limit_m, metres), np.where(z < below, limit_deg, degrees)
-    return metres, np.deg2rad(degrees)
-
-
-def alert_limit(z_m: float, pl_axial_m: float) -> tuple[float, float]:
-    """`alert_limits` of one pose."""
-    z = z_m - pl_axial_m
-    for below, limit_m, limit_deg in _NEAR_LIMITS:
-        if z < below:
-            return limit_m, math.radians(limit_deg)
-    return _FAR_SHARE * z, math.radians(_FAR_DEG)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,20 +114,21 @@ def _apart(a: Track, b: Track) -> Array:
     return np.array([math.hypot(at[0], at[1]), abs(at[2]), turn, bearing, distance])
 
 
-def pose_holds(bound: Bounds) -> bool:
-    """Whether the full pose's protection levels are inside the alert limits."""
+def pose_holds(bound: Bounds, limits: AlertLimits) -> bool:
+    """Whether the full pose's protection levels are inside the alert limits of the dock."""
     pl = bound.protection
-    limit_m, limit_rad = alert_limit(float(bound.T_dock_cam[2, 3]), pl.axial_m)
-    return pl.lateral_m < limit_m and pl.axial_m < limit_m and pl.angle_rad < limit_rad
+    lateral_m, axial_m, angle_rad = limits.of_pose(float(bound.T_dock_cam[2, 3]), pl.axial_m)
+    return pl.lateral_m < lateral_m and pl.axial_m < axial_m and pl.angle_rad < angle_rad
 
 
-def guide_holds(bound: Bounds) -> bool:
-    """Whether bearing and range may be used: by their own limits from afar, near the dock as the pose may."""
+def guide_holds(bound: Bounds, limits: AlertLimits) -> bool:
+    """Whether bearing and range may be used: by their own limits from afar, near the dock where the pose may be."""
     guide = bound.guide
-    if guide.range_m - guide.pl_range_m < GUIDE_FROM_M or abs(guide.bearing_x_rad) > math.pi / 2.0:
-        return pose_holds(bound)
-    limit_m = max(GUIDE_RANGE_M, GUIDE_RANGE_SHARE * (guide.range_m - guide.pl_range_m))
-    return guide.pl_bearing_rad < GUIDE_BEARING_RAD and guide.pl_range_m < limit_m
+    near_end_m = guide.range_m - guide.pl_range_m
+    if not limits.applies_to_guide(guide.bearing_x_rad, near_end_m):
+        return pose_holds(bound, limits)
+    bearing_rad, range_m = limits.of_guide(near_end_m)
+    return guide.pl_bearing_rad < bearing_rad and guide.pl_range_m < range_m
 
 
 def stage(track: Track, plan: Plan) -> Stage | None:

@@ -288,7 +288,7 @@ class Localizer:
         first, config = self.beliefs[0], self.config.integrity
         bound = integrity.bounds(self.beliefs, config)
         proven = verify.is_proven(first, self.margin, config)
-        valid, used = proven and integrity.pose_holds(bound), first.n_used
+        valid, used = proven and integrity.pose_holds(bound, self.station.alert_limits), first.n_used
         self._stage = integrity.stage(first, self._plan) or self._stage
         return Fix(
             detections.frame,
@@ -302,7 +302,7 @@ class Localizer:
             match=Match(detections, match.light_of(first.name, len(detections))),
             covariance=bound.covariance if valid else None,
             protection=bound.protection if valid else None,
-            guide=bound.guide if proven and integrity.guide_holds(bound) else None,
+            guide=bound.guide if proven and integrity.guide_holds(bound, self.station.alert_limits) else None,
             nis=first.nis / (2 * used) if status == "tracking" else math.nan,
         )
 

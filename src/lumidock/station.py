@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from lumidock.alert_limits import DEFAULT_ALERT_LIMITS, AlertLimits, Band, GuideLimits
 from lumidock.datatypes import Array, Indices, require_shape
+from lumidock.errors import InputError
 from lumidock.yamlfile import read_mapping, validate
 
 Color = Literal["white", "blue", "cyan", "green", "red"]
@@ -28,7 +30,10 @@ class Station:
 
     `p_dock` (N, 3) m; `layer` (N,) index into `layers`; `axis` (N, 3) unit vectors out of the lamps; `beam_deg` (N,)
     full angle at half intensity; `power_w` (N,) radiant power; `docking_point` (3,) m where the camera must end.
-    Sigmas are 1-sigma survey and calibration errors.
+    Sigmas are 1-sigma survey and calibration errors: `sigma_light_m` of each light's position along each axis, one
+    number for all lights or one for each (N,), and `sigma_layer_m` of a rigid offset that a layer's lights share.
+    `alert_limits` decide when a pose or a guide may be used. `dock_exclusive` says that no other array of lights which
+    looks like this dock can come into view.
     """
 
     name: str
@@ -41,13 +46,17 @@ class Station:
     beam_deg: Array
     power_w: Array
     docking_point: Array
-    sigma_light_m: float
+    sigma_light_m: float | Array
     sigma_layer_m: float
     sigma_focal: float
     sigma_center_px: float
+    alert_limits: AlertLimits = DEFAULT_ALERT_LIMITS
+    dock_exclusive: bool = True
 
     def __post_init__(self) -> None:
         n = len(self.ids)
+        if np.ndim(self.sigma_light_m):
+            require_shape("sigma_light_m", np.asarray(self.sigma_light_m), n)
         for name, shape in {
             "p_dock": (n, 3),
             "axis": (n, 3),
@@ -69,19 +78,50 @@ class Station:
         depth = {name: float(self.p_dock[self.lights_of(name), 2].mean()) for name in self.layers}
         return tuple(sorted(self.layers, key=lambda name: -depth[name]))
 
+    def layer_rank(self, light: int) -> int:
+        """Which layer a light belongs to, counted from the front one, 0."""
+        return self.layers_front_to_rear().index(self.layers[self.layer[light]])
+
+    def front_extent_m(self) -> float:
+        """Largest distance between two lights of the front layer, the size of the dock's entrance."""
+        p_dock = self.p_dock[self.lights_of(self.layers_front_to_rear()[0])]
+        return float(np.linalg.norm(p_dock[:, None] - p_dock[None], axis=2).max())
+
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
 
+_Sigma = Annotated[float, Field(ge=0)]
+_Limit = Annotated[float, Field(gt=0)]
+
+
 class _SurveySigma(_Strict):
-    light_m: Annotated[float, Field(ge=0)] = 0.002
-    layer_m: Annotated[float, Field(ge=0)] = 0.005
+    light_m: _Sigma = 0.002
+    layer_m: _Sigma = 0.005
 
 
 class _CalibrationSigma(_Strict):
-    focal: Annotated[float, Field(ge=0)] = 0.003
-    center_px: Annotated[float, Field(ge=0)] = 2.0
+    focal: _Sigma = 0.003
+    center_px: _Sigma = 2.0
+
+
+class _Band(_Strict):
+    below_z_m: float
+    lateral_m: _Limit
+    axial_m: _Limit
+    angle_deg: Annotated[float, Field(gt=0, le=180)]
+
+
+class _GuideLimits(_Strict):
+    bearing_deg: Annotated[float, Field(gt=0, le=90)] = 1.5
+    range_m: _Limit = 0.3
+    range_share: Annotated[float, Field(gt=0, lt=1)] = 0.10
+    from_m: _Limit = 3.0
+
+
+class _GuideEntry(_Strict):
+    guide: _GuideLimits
 
 
 class _Light(_Strict):
@@ -92,6 +132,7 @@ class _Light(_Strict):
     axis: Vector = (0.0, 0.0, 1.0)
     beam_deg: Annotated[float, Field(gt=0, le=360)] = 120.0
     power_w: Annotated[float, Field(gt=0)] = 2.0
+    sigma_m: _Sigma | tuple[_Sigma, _Sigma, _Sigma] | None = None
 
     @model_validator(mode="after")
     def _axis_has_a_direction(self) -> Self:
@@ -107,6 +148,8 @@ class _StationFile(_Strict):
     docking_point: Vector = (0.0, 0.0, 0.0)
     survey_sigma: _SurveySigma = _SurveySigma()
     calibration_sigma: _CalibrationSigma = _CalibrationSigma()
+    dock_exclusive: bool = True
+    alert_limits: list[_Band | _GuideEntry] = []
     lights: list[_Light]
 
     @model_validator(mode="after")
@@ -129,16 +172,16 @@ class _StationFile(_Strict):
         return self
 
 
-def load_station(path: Path) -> Station:
+def load_station(path: Path | str) -> Station:
     """Read a station file.
 
-    Raises: InputError, one line, for anything the schema refuses.
+    Raises: InputError, one line, for anything the schema refuses, and for a file of another kind.
     """
-    content = validate(_StationFile, read_mapping(path), str(path))
+    content = validate(_StationFile, read_mapping(Path(path), "station"), str(path))
     lights = content.lights
     layers = tuple(dict.fromkeys(light.layer for light in lights))
     axis = np.array([light.axis for light in lights])
-    return Station(
+    station = Station(
         name=content.name,
         ids=tuple(light.id for light in lights),
         layers=layers,
@@ -149,8 +192,41 @@ def load_station(path: Path) -> Station:
         beam_deg=np.array([light.beam_deg for light in lights]),
         power_w=np.array([light.power_w for light in lights]),
         docking_point=np.array(content.docking_point),
-        sigma_light_m=content.survey_sigma.light_m,
+        sigma_light_m=_light_sigmas(content),
         sigma_layer_m=content.survey_sigma.layer_m,
         sigma_focal=content.calibration_sigma.focal,
         sigma_center_px=content.calibration_sigma.center_px,
+        dock_exclusive=content.dock_exclusive,
     )
+    try:
+        return replace(station, alert_limits=_alert_limits(content, station.front_extent_m()))
+    except ValueError as error:
+        raise InputError(f"{path}: alert_limits: {error}") from None
+
+
+def _light_sigmas(content: _StationFile) -> float | Array:
+    """One sigma for all lights, or one for each (N,) where any light has its own.
+
+    Of three numbers the largest holds for all axes: the estimator's survey states are the same along each of them.
+    """
+    common = content.survey_sigma.light_m
+    if all(light.sigma_m is None for light in content.lights):
+        return common
+    return np.array([common if light.sigma_m is None else np.max(light.sigma_m) for light in content.lights])
+
+
+def _alert_limits(content: _StationFile, extent_m: float) -> AlertLimits:
+    """The file's limits, and the defaults of a dock so large for what it does not give. Raises: ValueError."""
+    bands = tuple(
+        Band(entry.below_z_m, entry.lateral_m, entry.axial_m, math.radians(entry.angle_deg))
+        for entry in content.alert_limits
+        if isinstance(entry, _Band)
+    )
+    guides = [entry.guide for entry in content.alert_limits if isinstance(entry, _GuideEntry)]
+    if len(guides) > 1:
+        raise ValueError("guide is given twice")
+    guide = GuideLimits().for_dock(extent_m)
+    if guides:
+        given = guides[0]
+        guide = GuideLimits(math.radians(given.bearing_deg), given.range_m, given.range_share, given.from_m)
+    return AlertLimits(bands or DEFAULT_ALERT_LIMITS.bands, guide)

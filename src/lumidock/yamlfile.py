@@ -1,9 +1,10 @@
-"""Reading of YAML written by strangers: capped in size and depth, no aliases, no tags, no key given twice."""
+"""Reading of YAML files that users write: capped in size and depth, no aliases, no tags, no key given twice."""
 
 from __future__ import annotations
 
+import difflib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -12,6 +13,7 @@ from lumidock.errors import InputError
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 20
+_MOST_KEYS_LISTED = 40  # more would not fit into one line that a person reads
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -43,13 +45,36 @@ def _check_structure(text: str) -> None:
             raise yaml.YAMLError(f"nested deeper than {MAX_DEPTH}")
 
 
-def read_mapping(path: Path) -> dict[str, Any]:
+def read_mapping(path: Path, kind: str = "") -> dict[str, Any]:
     """Read a YAML file whose top level is a mapping.
 
-    Raises: InputError, one line, when it cannot be read or parsed, is over 1 MiB, nested too deep or uses aliases
-    or tags.
+    `kind` is what the file should be, a key of `_KINDS`. Raises: InputError, one line, when it cannot be read or
+    parsed, is over 1 MiB, nested too deep, uses aliases or tags, or is recognised as a file of another kind.
     """
-    return parse_mapping(read_text(path), path)
+    content = parse_mapping(read_text(path), path)
+    found = kind_of(content)
+    if kind and found not in ("", kind):
+        advice = "; convert it with `lumidock calib import`" if (found, kind) == ("Kalibr camchain", "camera") else ""
+        raise InputError(f"{path}: this is a {found} file, wanted a {kind} file{advice}")
+    return content
+
+
+# keys that only one kind of file has at its top level
+_KINDS = {
+    "station": {"lights", "docking_point", "survey_sigma"},
+    "camera": {"camera_matrix", "image_width", "distortion_model"},
+    "vehicle": {"T_body_cam", "body_frame"},
+    "scenario": {"path", "water", "daylight", "lamps", "around", "faults", "detections"},
+    "configuration": {"paper", "prior", "match", "track", "integrity", "detect", "label"},
+}
+
+
+def kind_of(content: dict[str, Any]) -> str:
+    """Which kind of lumidock's files the keys belong to, or `Kalibr camchain`; empty where they do not tell."""
+    if any(isinstance(entry, dict) and "intrinsics" in entry for entry in content.values()):
+        return "Kalibr camchain"
+    found = [kind for kind, keys in _KINDS.items() if keys & content.keys()]
+    return found[0] if len(found) == 1 else ""
 
 
 def read_text(path: Path) -> str:
@@ -81,14 +106,43 @@ def parse_mapping(text: str, path: Path) -> dict[str, Any]:
 def validate(model: type[Model], content: dict[str, Any], origin: str) -> Model:
     """Check `content` against a pydantic model.
 
-    Raises: InputError, one line naming `origin`, the place in it and what is wrong there.
+    Raises: InputError, one line naming `origin`, the place in it and what is wrong there; of an unknown key also the
+    nearest known one, and all keys of its section.
     """
     try:
         return model.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
-        place = " ".join(".".join(str(part) for part in first["loc"]).split())
+        place = " ".join(".".join(str(part) for part in first["loc"] if not str(part).startswith("_")).split())
         message = first["msg"].removeprefix("Value error, ")
         if first["type"] == "extra_forbidden":
-            message = "unknown key"
+            message = f"unknown key{_known_keys(model, first['loc'])}"
         raise InputError(f"{origin}: {place + ': ' if place else ''}{message}") from None
+
+
+def _known_keys(model: type[BaseModel], place: tuple[int | str, ...]) -> str:
+    """What could have been meant by the unknown key at the end of `place`."""
+    section: Any = model
+    for part in place[:-1]:
+        if isinstance(part, str):
+            section = _section_within(section, part)
+    if section is None:
+        return ""
+    keys = [field.alias or name for name, field in section.model_fields.items()]
+    near = difflib.get_close_matches(str(place[-1]), keys, n=1)
+    meant = f", did you mean {near[0]}?" if near else ""
+    return f"{meant} (known here: {', '.join(keys)})" if len(keys) <= _MOST_KEYS_LISTED else meant
+
+
+def _section_within(model: type[BaseModel] | None, key: str) -> type[BaseModel] | None:
+    """The model of one key of a model; None where the key has none of its own, or several."""
+    field = model.model_fields.get(key) if model is not None else None
+    models = [] if field is None else _models_in(field.annotation)
+    return models[0] if len(models) == 1 else model if field is None else None
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:  # noqa: ANN401  # any type annotation
+    """The pydantic models that a type annotation mentions."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [found for inner in get_args(annotation) for found in _models_in(inner)]

@@ -115,7 +115,7 @@ def simulated_frames(scenario: Scenario, station: Station, camera: Camera, seed:
 def run_draws(scenario: Scenario, station: Station, course: Course, rng: np.random.Generator) -> RunDraws:
     """What the run's draws decide; without survey and calibration errors, what the station and the camera say."""
     g, m, table = len(course.surface_m), len(station), scenario.detections
-    off = rng.normal(size=(g, m, 3)) * station.sigma_light_m
+    off = rng.normal(size=(g, m, 3)) * np.reshape(station.sigma_light_m, (-1, 1))
     off += (rng.normal(size=(g, len(station.layers), 3)) * station.sigma_layer_m)[:, station.layer]
     front = ~_is_rear(station)
     front_m, rear_m = (rng.uniform(*reach, (g, 1)) for reach in (table.front_range_m, table.rear_range_m))

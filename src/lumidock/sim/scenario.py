@@ -188,7 +188,7 @@ def load_scenario(name: str, settings: tuple[str, ...] = ()) -> Scenario:
         with as_file(files("lumidock.sim") / "scenarios" / f"{name}.yaml") as path:
             content = read_mapping(path)
     elif Path(name).suffix in (".yaml", ".yml"):
-        content = read_mapping(Path(name))
+        content = read_mapping(Path(name), "scenario")
     else:
         raise InputError(f"{name}: no such scenario; there are {', '.join(shipped_scenarios())}, or give a .yaml file")
     for setting in settings:

@@ -97,7 +97,7 @@ def _open_folder(path: Path, fps: float | None, bits: int) -> Source:
 def _open_sequence(path: Path, camera: Path | None, station: Path | None, bits: int) -> Source:
     """A folder with timestamps.csv, and frames/ or detections.csv."""
     stamps, detections, attitude = path / "timestamps.csv", path / "detections.csv", path / "attitude.csv"
-    rows = _read_stamps(stamps)
+    rows = _read_csv(stamps, ("frame", "t_ns") if detections.exists() else ("frame", "file", "t_ns"))
     if not rows:
         raise InputError(f"{stamps}: no frames")
     attitudes = _read_attitudes(attitude) if attitude.exists() else _Attitudes([], np.empty((0, 5)))
@@ -123,10 +123,6 @@ def _read_csv(path: Path, columns: tuple[str, ...]) -> list[Row]:
             return list(reader)
     except (OSError, csv.Error) as error:
         raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
-
-
-def _read_stamps(path: Path) -> list[Row]:
-    return _read_csv(path, ("frame", "file", "t_ns"))
 
 
 def _stamp(text: str) -> int | None:

@@ -54,7 +54,7 @@ class _VehicleFile(BaseModel):
 
 def load_vehicle(path: Path) -> Vehicle:
     """Read a vehicle file. Raises: InputError, one line, for anything the schema refuses."""
-    content = validate(_VehicleFile, read_mapping(path), str(path))
+    content = validate(_VehicleFile, read_mapping(path, "vehicle"), str(path))
     frames = content.dock_frame, content.camera_frame, content.body_frame
     if len(set(frames)) != len(frames):
         raise InputError(f"{path}: dock_frame, camera_frame and body_frame have to differ")
