@@ -15,7 +15,17 @@ import cv2
 import typer
 
 from lumidock.camera import load_camera, save_camera
-from lumidock.cli import calibration, doctoring, evaluation, exporting, inspection, reporting, serving, stations
+from lumidock.cli import (
+    calibration,
+    doctoring,
+    evaluation,
+    exporting,
+    inspection,
+    reporting,
+    serving,
+    setting_up,
+    stations,
+)
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
@@ -64,6 +74,7 @@ _COMMANDS = (
     serving,
     calibration,
     stations,
+    setting_up,
     doctoring,
 )  # importing them adds their commands
 

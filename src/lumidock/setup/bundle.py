@@ -12,7 +12,7 @@ import numpy as np
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Array, Indices
-from lumidock.setup.observations import Observations
+from lumidock.setup.observations import LEAST_LIGHTS, Observations
 
 CALIBRATION = 5  # relative focal error; shift of the principal point u, v px; radial distortion beyond the file's k1, k2
 _CAUCHY = 3.0  # sigmas at which a residual counts half; costs 5 % of efficiency on Gaussian noise
@@ -21,6 +21,7 @@ _MEDIAN_CHI2 = 1.386  # of two degrees of freedom
 _MOST_STEPS, _CONVERGED = 60, 1e-5  # Levenberg-Marquardt; relative fall of the cost
 _BELIEVED = 4.0  # sigmas that a calibration may leave its prior
 _FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
+_OPEN = 1e-9  # information 1/m^2, 1/rad^2 on a pose that nothing else holds; no frame's own comes near it
 _LEAST_NOISE = 0.1  # of the stated error: no detector is so much better than it says
 _ENOUGH = 60  # residuals of a light from which its own noise is judged; below, that of all lights holds
 
@@ -136,7 +137,7 @@ def refine_poses(
         w = _weights(line.residual, sigma_px)
         A = np.einsum("fmki,fm,fmkj->fij", line.J_pose, w, line.J_pose)
         a = np.einsum("fmki,fm,fmk->fi", line.J_pose, w, np.nan_to_num(line.residual))
-        A += damping[:, None, None] * (np.eye(6) * A + 1e-9 * np.eye(6))
+        A += damping[:, None, None] * (np.eye(6) * A + _OPEN * np.eye(6))
         step = (np.linalg.inv(A) @ a[..., None])[..., 0]
         tried = _moved(T, step)
         new = _frame_costs(observed, camera, Estimate(p_dock, tried, np.zeros(CALIBRATION)), sigma_px)
@@ -272,7 +273,7 @@ def _of_prior(prior: Prior, at: Estimate) -> tuple[Array, Array]:
 
 def _stepped(at: Estimate, normal: _Normal, damping: float) -> Estimate:
     """One damped Gauss-Newton step: first what the frames share, then each pose."""
-    A = normal.A + damping * np.eye(6) * normal.A + 1e-12 * np.eye(6)
+    A = normal.A + damping * np.eye(6) * normal.A + _OPEN * np.eye(6)
     AB = np.linalg.inv(A) @ np.concatenate([normal.B, normal.a[..., None]], axis=2)
     f, _, s = normal.B.shape
     flat_B, flat_AB = normal.B.reshape(6 * f, s), AB.reshape(6 * f, s + 1)
@@ -318,11 +319,12 @@ def _conclude(
     sigma = observed.sigma_px * noise
     r2 = (line.residual**2).sum(axis=2) / sigma**2
     used = np.isfinite(r2) & (r2 < _OUTLIER**2)
+    used &= (used.sum(axis=1) >= LEAST_LIGHTS)[:, None]
     spread = max(float(r2[used].mean()) / _expected_chi2(used), 1.0) if used.any() else 1.0
     repeats = _repeats(observed, line.residual / sigma[..., None], used) * spread
     normal = _normal(line, prior, at, sigma, used / (sigma**2 * repeats))
     f, _, s = normal.B.shape
-    AB = np.linalg.inv(normal.A + 1e-12 * np.eye(6)) @ normal.B
+    AB = np.linalg.inv(normal.A + _OPEN * np.eye(6)) @ normal.B
     S = normal.C - normal.B.reshape(6 * f, s).T @ AB.reshape(6 * f, s)
     S = 0.5 * (S + S.T)
     covariance = np.linalg.inv(S) if calibrate else _considered(S, _calibration_sigma(prior))
@@ -382,5 +384,16 @@ def tilt_sigma(observed: Observations, camera: Camera, at: Estimate) -> Array:
     line = _linearised(observed, camera, at)
     w = np.where(observed.seen, 1.0 / observed.sigma_px**2, 0.0)
     A = np.einsum("fmki,fm,fmkj->fij", line.J_pose, w, line.J_pose)
-    covariance = np.linalg.inv(A + 1e-9 * np.eye(6))
+    covariance = np.linalg.inv(A + _OPEN * np.eye(6))
     return np.asarray(np.sqrt(np.maximum(covariance[:, 3, 3], covariance[:, 4, 4])))
+
+
+def information(observed: Observations, camera: Camera, at: Estimate) -> Array:
+    """What frames say of positions and calibration (S, S), their poses eliminated and nothing known before."""
+    line = _linearised(observed, camera, at)
+    m = len(at.p_dock)
+    nothing = Prior(at.p_dock, np.full((m, 3), np.inf), np.inf, np.inf, np.inf)
+    normal = _normal(line, nothing, at, observed.sigma_px, np.where(observed.seen, 1.0 / observed.sigma_px**2, 0.0))
+    f, _, s = normal.B.shape
+    AB = np.linalg.inv(normal.A + _OPEN * np.eye(6)) @ normal.B
+    return np.asarray(normal.C - normal.B.reshape(6 * f, s).T @ AB.reshape(6 * f, s))

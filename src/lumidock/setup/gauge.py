@@ -18,10 +18,10 @@ def similarity_generators(p_dock: Array) -> Array:
     return G.reshape(-1, 7)
 
 
-def rigid_free(covariance: Array, p_dock: Array) -> Array:
-    """Covariance (3M, 3M) of the shape of the array: of positions after the best rigid fit to the true ones."""
+def rigid_free(covariance: Array, p_dock: Array, seen: np.ndarray) -> Array:
+    """Covariance (3M, 3M) of the shape: of positions after the best rigid fit of the lights `seen` (M,) to the true."""
     G, n = similarity_generators(p_dock)[:, :6], p_dock.size
-    E = np.eye(n) - G @ np.linalg.pinv(G)
+    E = np.eye(n) - G @ np.linalg.pinv(G * np.repeat(seen, 3)[:, None])
     return np.asarray(E @ covariance[:n, :n] @ E.T)
 
 

@@ -26,6 +26,7 @@ from lumidock.station import Station
 _ROUNDS = 5  # of association and adjustment; a drawing 10 cm off settles in three
 _MOST_FRAMES = 150  # of one recording; more lengthen a survey and add little, as the camera's errors are shared
 _LEAST_FRAMES = 12  # six unknowns a frame: fewer frames leave the lights little more than the drawing says
+_LEAST_SEEN = 10  # frames; a light identified in fewer may be another lamp or a glint, and stays as drawn
 _MOST_TILT_RAD = 0.02  # 1 sigma of a frame's tilt; beyond, its flip fits as well and pulls the lights out of plane
 _DECIDED = 9.0  # cost by which the flip of a plane must fit worse: 3 sigmas
 _LEAST_SIGMA_M = 0.0005  # a lamp's optical centre is not known better than this
@@ -82,7 +83,7 @@ def survey(
         adjusted = bundle.adjust(observed, camera, prior, Estimate(station.p_dock, poses, calibration))
         moved = np.abs(adjusted.estimate.p_dock - station.p_dock)
         estimate = adjusted.estimate
-        covariance = rigid_free(adjusted.covariance, estimate.p_dock)
+        covariance = rigid_free(adjusted.covariance, estimate.p_dock, adjusted.used.any(axis=0))
         station = replace(station, p_dock=estimate.p_dock)
         sigma = np.maximum(np.sqrt(np.diagonal(covariance)).reshape(-1, 3), _LEAST_SIGMA_M)
         if (moved < _SETTLED * sigma + 1e-4).all():
@@ -117,7 +118,7 @@ def prior_of(
 
 def _declared(station: Station, sigma_m: Array) -> Station:
     """The station as the localizer is to take it: the errors of its lights are those of the survey so far."""
-    return replace(station, sigma_light_m=float(np.sqrt((sigma_m**2).mean())), sigma_layer_m=0.0)
+    return replace(station, sigma_light_m=np.sqrt((sigma_m**2).mean(axis=1)), sigma_layer_m=0.0)
 
 
 def _usable(
@@ -142,7 +143,9 @@ def _usable(
             f"{len(kept)} frames with four or more identified lights and a clear pose, wanted at least {_LEAST_FRAMES}:"
             " give nearer frames, or frames that show both layers, and state how far off the drawing may be"
         )
-    return observed.take(kept), poses[kept]
+    observed = observed.take(kept)
+    rare = observed.seen.sum(axis=0) < _LEAST_SEEN
+    return observed.without(np.broadcast_to(rare, observed.seen.shape)), poses[kept]
 
 
 def clear_poses(observed: Observations, camera: Camera, p_dock: Array, sigma_m: Array) -> tuple[Array, np.ndarray]:
@@ -203,7 +206,7 @@ def _conclude(
     drawing: Station, camera: Camera, prior: Prior, observed: Observations, adjusted: Adjusted, rounds: int
 ) -> Survey:
     estimate = adjusted.estimate
-    covariance = rigid_free(adjusted.covariance, estimate.p_dock)
+    covariance = rigid_free(adjusted.covariance, estimate.p_dock, adjusted.used.any(axis=0))
     sigma = np.maximum(np.sqrt(np.diagonal(covariance)).reshape(-1, 3), _LEAST_SIGMA_M)
     scale, scale_before = _scale_sigmas(covariance, prior, estimate.p_dock)
     held_out = _held_out(observed, camera, prior, adjusted)
