@@ -28,7 +28,7 @@ _COLUMNS = (
     "last valid, z m",
     "longest gap in valid after, s (from z m)",
     "range error 5-7 m, mean / 95 %, mm",
-    "wrong names",
+    "wrong identities",
     "valid",
     "hazardous",
 )
@@ -45,7 +45,7 @@ def docking(scenario: str, seed: int, folder: str) -> dict[str, Any]:
         "frames": judged["frames"],
         "valid": judged["valid"],
         "guide": judged["guide"],
-        "wrong": judged["labels"]["wrong"],
+        "wrong": judged["identities"]["wrong"],
         "hazardous": hazards["valid"]["any"] + hazards["guide"]["any"],
     }
 

@@ -35,8 +35,8 @@ def simulate_and_run(scenario: str, seed: int, folder: Path) -> tuple[Path, Path
     return sequence, out
 
 
-def search_labels(sequence: Path, out: Path) -> tuple[int, int]:
-    """Frames with four or more front lights detected and no other spot taken for front; those of them named right."""
+def search_identities(sequence: Path, out: Path) -> tuple[int, int]:
+    """Frames with four or more front lights detected and no other detection labelled front; those identified right."""
     true: dict[str, dict[str, np.ndarray]] = {}
     for row in read_rows(sequence / "lights_truth.csv", ("frame", "light", "u_px", "v_px")):
         true.setdefault(row["frame"], {})[row["light"]] = np.array([float(row["u_px"]), float(row["v_px"])])
@@ -48,12 +48,12 @@ def search_labels(sequence: Path, out: Path) -> tuple[int, int]:
         front = [(_maker(row, true[frame]), row["light"]) for row in rows if float(row["p_rear"]) <= 0.5]
         if len(front) >= 4 and all(maker.startswith("F") for maker, _ in front):
             eligible += 1
-            right += all(maker == named for maker, named in front)
+            right += all(maker == light for maker, light in front)
     return eligible, right
 
 
 def _maker(detection: dict[str, str], lights: dict[str, np.ndarray]) -> str:
-    """The light that made a spot, or nothing."""
+    """The light that made a detection, or nothing."""
     at = np.array([float(detection["u_px"]), float(detection["v_px"])])
     light = min(lights, key=lambda name: float(np.hypot(*(lights[name] - at))), default="")
     return light if light and np.hypot(*(lights[light] - at)) < _SAME_DETECTION_PX else ""
@@ -79,27 +79,27 @@ def rear_reach_m(gray: Literal["max", "luma"], seed: int) -> float:
 def main() -> tuple[dict[str, object], list[str]]:
     """One row a seed, and the search."""
     lines = [
-        "| approach, seed | front fixes, z m | rear fixes, z m | longest gap, s | layer offset, m | wrong names |",
+        "| approach, seed | front fixes, z m | rear fixes, z m | longest gap, s | layer offset, m | wrong identities |",
         "|---|---|---|---|---|---|",
     ]
     content: dict[str, object] = {}
     for seed in SEEDS:
         with TemporaryDirectory() as folder:
             result: dict[str, Any] = evaluate(*reversed(simulate_and_run("approach", seed, Path(folder))))
-        front, rear, labels = result["layers"]["front"], result["layers"]["rear"], result["labels"]
+        front, rear, identities = result["layers"]["front"], result["layers"]["rear"], result["identities"]
         lines.append(
             f"| {seed} | {front['first_z_m']:.2f} to {front['last_z_m']:.2f} | {rear['first_z_m']:.2f} to "
             f"{rear['last_z_m']:.2f} | {result['longest_gap_s']:.2f} | {result['layers']['offset_m']:.3f} "
-            f"| {labels['wrong']} of {labels['named']} |"
+            f"| {identities['wrong']} of {identities['identified']} |"
         )
         content[f"approach-{seed}"] = result
     lines.append("| paper | 18.62 to 1.73 | 10.07 to -3 | - | < 0.3 | - |")
     with TemporaryDirectory() as folder:
-        eligible, right = search_labels(*simulate_and_run("rectangle", SEEDS[0], Path(folder)))
+        eligible, right = search_identities(*simulate_and_run("rectangle", SEEDS[0], Path(folder)))
     reach = {gray: rear_reach_m(gray, SEEDS[0]) for gray in ("max", "luma")}
     content["rear_reach_m"] = reach
     content["rectangle"] = {"eligible": eligible, "right": right}
-    lines += ["", f"Rectangular search at 15 m: {right} of {eligible} frames named right.", ""]
+    lines += ["", f"Rectangular search at 15 m: {right} of {eligible} frames identified right.", ""]
     lines.append(
         f"All six rear lights are found from z = {reach['max']:.1f} m with the largest channel as gray image, from "
         f"{reach['luma']:.1f} m with luma."

@@ -37,7 +37,7 @@ def main() -> tuple[dict[str, object], list[str]]:
     """The table, with the paper's own figures."""
     lines = [
         "| front lights missing + spurious | frames | PSO, % | paper | wrong ones the filter passes "
-        "| PSO + filter + BTEKF, % | paper | wrong names accepted |",
+        "| PSO + filter + BTEKF, % | paper | wrong identities accepted |",
         "|---|---|---|---|---|---|---|---|",
     ]
     content: dict[str, object] = {}

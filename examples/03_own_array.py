@@ -37,7 +37,7 @@ T_dock_cam[:3, 3] = 0.3, -0.2, 6.0
 uv = project_lights(camera, T_dock_cam, station.p_dock)
 rng, localizer = np.random.default_rng(0), Localizer(station, camera)
 for number in range(5):
-    noisy = uv + rng.normal(0.0, 0.3, uv.shape)  # the very same spots again would be told as a frozen picture
+    noisy = uv + rng.normal(0.0, 0.3, uv.shape)  # exactly the same detections again would be reported as a frozen image
     fix = localizer.process_detections(Detections.from_uv(str(number), number * 100_000_000, noisy))
 assert fix.match is not None
 print("named:", ", ".join(station.ids[light] for light in fix.match.light if light >= 0))

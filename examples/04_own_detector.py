@@ -1,4 +1,4 @@
-"""A detector of your own, through the light door: only the centres of the spots are needed.
+"""A detector of your own: `process_detections` needs only the centroids of the detections.
 
 python examples/04_own_detector.py PICTURE STATION CAMERA
 """
@@ -24,4 +24,4 @@ if len(sys.argv) != 4:
 picture, station, camera = map(Path, sys.argv[1:4])
 localizer = Localizer(load_station(station), load_camera(camera))
 fix = localizer.process_detections(Detections.from_uv(picture.stem, 0, detections(cv2.imread(str(picture)))))
-print(f"{fix.n_seen} spots, {fix.n_used} of them lights of the dock: {fix.reason or 'valid'}")
+print(f"{fix.n_seen} detections, {fix.n_used} of them lights of the dock: {fix.reason or 'valid'}")

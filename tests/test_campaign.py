@@ -54,7 +54,7 @@ def test_the_table_is_the_same_for_any_number_of_workers(whole, tmp_path):
     assert finish(small(), tmp_path / "two", workers=2) == whole
     table = json.loads(whole[0])
     assert table["rows"][0]["counts"]["frames"] == 12 * 8
-    assert table["rows"][0]["counts"]["named"] == 12 * 8 * 6
+    assert table["rows"][0]["counts"]["identified"] == 12 * 8 * 6
 
 
 def test_a_campaign_takes_up_where_it_was(whole, tmp_path, monkeypatch):
@@ -220,7 +220,7 @@ def test_a_campaign_prints_its_table(lumidock, tmp_path):
 
 def test_a_scenario_file_and_its_config_are_used(lumidock, tmp_path):
     (tmp_path / "my.yaml").write_text(
-        "name: a|b/../c\nabout: x\npath: {kind: draws, count: 3}\nconfig: {paper: {max_spots: 2}}\n"
+        "name: a|b/../c\nabout: x\npath: {kind: draws, count: 3}\nconfig: {paper: {max_detections: 2}}\n"
     )
     words = ("campaign", tmp_path / "my.yaml", "--seeds", "0:1", *PAPER[:2], "--out", tmp_path / "out")
     code, out, _ = lumidock(*words, "--json")

@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from lumidock.alert_limits import DEFAULT_ALERT_LIMITS
 from lumidock.evaluation.claims import (
     GuideClaims,
     PoseClaims,
@@ -38,14 +39,14 @@ def claims(*rows, covariance=None, stage=None):
     errors[:, :3], errors[:, 3] = table[:, 1:4], np.deg2rad(table[:, 4])
     covariance = np.full((len(table), 6, 6), np.nan) if covariance is None else covariance
     stage = stage or ["front"] * len(table)
-    return PoseClaims(table[:, 0], errors, table[:, 5:] * [1, 1, np.pi / 180], covariance, stage)
+    return PoseClaims(table[:, 0], errors, table[:, 5:] * [1, 1, np.pi / 180], covariance, stage, DEFAULT_ALERT_LIMITS)
 
 
 def guides(*rows):
     """Guides of rows (claimed bearing x deg, y deg, range m, true ones, levels bearing deg, range m)."""
     table = np.array(rows, float).reshape(-1, 8)
     table[:, [0, 1, 3, 4, 6]] *= np.pi / 180
-    return GuideClaims(table[:, :3], table[:, 3:6], table[:, 6:])
+    return GuideClaims(table[:, :3], table[:, 3:6], table[:, 6:], DEFAULT_ALERT_LIMITS)
 
 
 @given(transforms(), st.integers(0, 2**32 - 1))
@@ -217,7 +218,9 @@ def test_an_honest_level_is_exceeded_as_often_as_it_says(rng):
     e = rng.normal(size=(100_000, 6)) * [0.1, 0.1, 0.2, 0.01, 0.01, 0.01]
     level = 0.1 * np.sqrt(-2.0 * np.log(0.01))  # of a Rayleigh distribution, once in a hundred
     levels = np.tile([level, 10.0, 10.0], (len(e), 1))
-    poses = PoseClaims(np.full(len(e), 20.0), e, levels, np.full((len(e), 6, 6), np.nan), ["front"] * len(e))
+    poses = PoseClaims(
+        np.full(len(e), 20.0), e, levels, np.full((len(e), 6, 6), np.nan), ["front"] * len(e), DEFAULT_ALERT_LIMITS
+    )
     assert_close(over_level(poses)["lateral"]["over"], 1000, atol=4 * np.sqrt(1000))
 
 
@@ -245,4 +248,6 @@ def test_gaps_are_measured_between_usable_frames(t_ns, longest, long):
 def test_claims_of_unequal_length_are_refused(name):
     fields = {"errors": np.zeros((2, 6)), "levels": np.zeros((2, 3)), "covariance": np.zeros((2, 6, 6))}
     with pytest.raises(ValueError, match=f"{name} has shape"):
-        PoseClaims(z_m=np.zeros(2), stage=["front"] * 2, **fields | {name: fields[name][:1]})
+        PoseClaims(
+            z_m=np.zeros(2), stage=["front"] * 2, alert_limits=DEFAULT_ALERT_LIMITS, **fields | {name: fields[name][:1]}
+        )

@@ -45,7 +45,11 @@ def test_a_killed_run_leaves_whole_rows(lumidock, long, tmp_path):
 
 def test_an_interrupted_run_leaves_valid_files(lumidock, long, tmp_path):
     process, out, err = stopped(tmp_path / "run", long, signal.SIGINT)
-    assert (process.returncode, out, err) == (130, "", "")
+    assert (process.returncode, out) == (130, "")
+    assert err == (
+        f"lumidock: interrupted; {tmp_path / 'run'} holds a complete row for every frame so far; `run` with --force "
+        "begins again\n"
+    )
     counts = json.loads((tmp_path / "run" / "run.json").read_text())["counts"]
     assert 20 <= counts["frames"] == whole_rows(tmp_path / "run") < 1501
     assert counts["finished"] is False
@@ -57,7 +61,9 @@ def test_an_interrupted_simulation_can_be_done_again(lumidock, tmp_path):
     wait_for(lambda: len(list((tmp_path / "sim").glob("frames/*"))) > 2)
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=30)
-    assert (process.returncode, out, err) == (130, "", "")
+    assert (process.returncode, out) == (130, "")
+    assert err.startswith(f"lumidock: interrupted; {tmp_path / 'sim'} holds an incomplete sequence")
+    assert len(err.splitlines()) == 1
     assert lumidock("run", tmp_path / "sim", "--out", tmp_path / "run")[0] == 2
     assert lumidock("sim", "trials", "--detections", "--out", tmp_path / "sim", "--force")[0] == 0
 

@@ -11,7 +11,7 @@ from bench.shipped import shipped_camera, shipped_station
 from lumidock.datatypes import Fix, Guide, Match, Protection
 from lumidock.evaluation import claims
 from lumidock.evaluation.campaign_table import row_of
-from lumidock.evaluation.counts import Run, Tally, guide_claims, pose_claims, rotation_vectors, tally_run
+from lumidock.evaluation.counts import SimulatedRun, Tally, guide_claims, pose_claims, rotation_vectors, tally_run
 from lumidock.geometry import bearing_and_range, so3_exp, so3_log
 from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import load_scenario
@@ -43,7 +43,7 @@ def a_run(name, answer, *settings, seed=0, **kwargs):
     """A run in which `answer(i, frame)` is the fix of frame i."""
     scenario = load_scenario(name, settings)
     frames = list(simulated_frames(scenario, STATION, CAMERA, seed))
-    return Run(scenario, seed, frames, [answer(i, frame) for i, frame in enumerate(frames)], **kwargs)
+    return SimulatedRun(scenario, seed, frames, [answer(i, frame) for i, frame in enumerate(frames)], **kwargs)
 
 
 def test_a_method_that_is_always_right_has_no_fault():
@@ -51,7 +51,7 @@ def test_a_method_that_is_always_right_has_no_fault():
     counts = tally.counts
     seen = counts["frames"] - counts["frames_blind"]
     assert counts["accepted"] == counts["valid"] == counts["guide"] == seen > 0
-    assert counts["named"] > 5 * seen
+    assert counts["identified"] > 5 * seen
     assert counts["frames"] == sum(counts[f"frames_{word}"] for word in ("few", "some", "full"))
     faults = ("wrong", "hazardous", "over_level", "stale_v", "stale_g", "never")
     assert not any(count for name, count in counts.items() if name.startswith(faults))
@@ -125,12 +125,12 @@ def test_wrong_names_are_told_from_harmful_coincidences():
 
     run = a_run("missing-1", answer, "path.count=10")
     counts = tally_run(run).counts
-    assert (counts["named"], counts["frames_with_wrong"]) == (60, 4)
+    assert (counts["identified"], counts["frames_with_wrong"]) == (60, 4)
     assert (counts["wrong_else"], counts["wrong_coincident"]) == (8, 0)
 
 
 @pytest.mark.parametrize(("off_px", "coincident"), [(1.4, True), (1.6, False)])
-def test_a_stray_where_a_missing_light_would_be_is_a_coincidence(off_px, coincident):
+def test_a_spurious_detection_where_a_missing_light_would_be_is_a_coincidence(off_px, coincident):
     def answer(_, frame):
         fix = right(frame, match=Match(frame.detections, frame.light.copy()))
         frame.detections.uv[0] = frame.uv[frame.light[0]] + [off_px, 0.0]
@@ -223,13 +223,13 @@ def test_black_outs_show_stale_answers_and_the_way_back():
     assert (len(dark), dark[-1] - dark[0]) == (15, 14)
     lost = {*range(seen.argmax()), dark[-1] + 1, dark[-1] + 2}
     fixes = [nothing(frame) if i in lost else right(frame) for i, frame in enumerate(frames)]
-    tally = tally_run(Run(scenario, 0, frames, fixes))
+    tally = tally_run(SimulatedRun(scenario, 0, frames, fixes))
     assert tally.counts["stale_valid"] == tally.counts["stale_guide"] == 15 - 4  # four whole frames in 0.3 s
     assert (tally.counts["blinded_valid"], tally.counts["never_back_valid"]) == (1, 0)
     assert tally.largest["frames_back_valid"] == 3.0
     assert row_of(tally)["frames_back"]["guide"]["median"] == pytest.approx(3.0, rel=0.02)
     never = [nothing(frame) if i > dark[-1] else fix for i, (frame, fix) in enumerate(zip(frames, fixes, strict=True))]
-    counts = tally_run(Run(scenario, 0, frames, never)).counts
+    counts = tally_run(SimulatedRun(scenario, 0, frames, never)).counts
     assert (counts["blinded_valid"], counts["never_back_valid"]) == (1, 1)
 
 

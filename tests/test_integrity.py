@@ -8,12 +8,12 @@ from conftest import assert_close
 from scipy.stats import chi
 
 from lumidock import integrity, match, track
+from lumidock.alert_limits import DEFAULT_ALERT_LIMITS
 from lumidock.camera import load_camera
 from lumidock.config import Config, IntegrityConfig
 from lumidock.datatypes import Guide, Protection
 from lumidock.evaluation import claims
 from lumidock.geometry import bearing_and_range, se3_exp, se3_inverse
-from lumidock.alert_limits import DEFAULT_ALERT_LIMITS
 from lumidock.integrity import Bounds, bounds, guide_holds, pose_holds, sigma_factors
 from lumidock.station import load_station
 from lumidock.track import NO_PLANE, Track
@@ -188,7 +188,9 @@ def test_a_guide_from_afar_has_its_own_limits():
 @pytest.mark.parametrize("z_m", [-2.5, 0.1, 1.0, 2.9])
 def test_a_guide_near_the_dock_holds_as_the_pose_does(z_m, angle):
     bound = bound_of(z_m, angle=angle, bearing=9.0, distance=0.0)
-    assert guide_holds(bound, DEFAULT_ALERT_LIMITS) == pose_holds(bound, DEFAULT_ALERT_LIMITS) == (angle < math.radians(5))
+    assert (
+        guide_holds(bound, DEFAULT_ALERT_LIMITS) == pose_holds(bound, DEFAULT_ALERT_LIMITS) == (angle < math.radians(5))
+    )
     # a far guide whose range may end near the dock is near
     assert guide_holds(bound_of(3.5, angle=angle, distance=0.6), DEFAULT_ALERT_LIMITS) == (angle < math.radians(5))
 

@@ -103,10 +103,16 @@ def write_lights_truth(folder, rows):
     (folder / "lights_truth.csv").write_text("frame,light,u_px,v_px,visible,snr\n" + "\n".join(rows) + "\n")
 
 
-def test_a_name_is_wrong_when_its_light_is_elsewhere_or_not_visible(judge, tmp_path):
-    write_lights_truth(tmp_path / "truth", ["a,A,0,22.9,1,9", "a,B,10,23.1,1,9", "a,C,20,20,0,1"])
-    result = judge({"a": pose(0, 0, 9)}, {"a": pose(0, 0, 9)}, lights={"a": [0, 1, 2, 3, -1]})
-    assert result["labels"] == {"named": 4, "wrong": 3}
+def test_an_identity_is_wrong_when_another_lit_lamp_is_nearer(judge, tmp_path):
+    one = {"a": pose(0, 0, 9)}
+    # A and C are right, though C saturates and has no SNR; B is too far off its own lamp; D is not in view at all
+    write_lights_truth(tmp_path / "truth", ["a,A,0,22.9,1,9", "a,B,10,23.1,1,9", "a,C,20,20,0,0"])
+    result = judge(one, one, lights={"a": [0, 1, 2, 3, -1]})
+    assert result["identities"] == {"identified": 4, "wrong": 1, "displaced": 1}
+    # A and B are exchanged; a dark lamp at the place of C's detection makes no light that C could be confused with
+    write_lights_truth(tmp_path / "truth", ["a,A,10,20,1,9", "a,B,0,20,1,9", "a,C,20,21,1,9", "a,D,20,20,0,0"])
+    result = judge(one, one, lights={"a": [0, 1, 2]})
+    assert result["identities"] == {"identified": 3, "wrong": 2, "displaced": 0}
 
 
 def test_frames_that_the_truth_lacks_are_not_judged(judge, tmp_path):
@@ -115,7 +121,7 @@ def test_frames_that_the_truth_lacks_are_not_judged(judge, tmp_path):
     result = judge(found, {"a": pose(0, 0, 9)}, lights={"a": [0], "b": [1, 2]}, layers=[("front", pose(0, 0, 9))])
     assert (result["frames"], result["valid"]) == (2, 2)
     assert_close(result["error"]["lateral_m"]["p95"], 0)
-    assert result["labels"] == {"named": 1, "wrong": 0}
+    assert result["identities"] == {"identified": 1, "wrong": 0, "displaced": 0}
     assert result["layers"]["front"]["fixes"] == 1
 
 
@@ -192,7 +198,7 @@ def test_a_guide_counts_beside_the_pose(judge_fixes):
         fix_at("d", 1100, None, None, reason="too_few"),
         fix_at("e", 1500, near, guide_at(near)),
         fix_at("f", 1700, near, None),
-        fix_at("strange", 1800, near, None),
+        fix_at("unlike", 1800, near, None),
     ]
     result = judge_fixes(fixes, dict.fromkeys("abcd", T) | dict.fromkeys("efg", near))
     assert [result[name] for name in ("frames", "valid", "guide", "guide_only")] == [7, 4, 4, 2]
@@ -283,7 +289,7 @@ def test_the_residual_is_that_of_named_lights_at_the_estimated_pose(judge, tmp_p
     # light A at (-0.9, 0.7): seen head-on from 10 m, 1000 px of focal length put it 90 px left of (90, 90), 70 px up
     save_camera(Camera(200, 200, np.array([[1000.0, 0, 90], [0, 1000.0, 90], [0, 0, 1]])), tmp_path / "run/camera.yaml")
     T = pose(0, 0, 10)
-    # the spots are at (0, 20), (10, 20); named A the first is exact, the second is off by (10, 0)
+    # detections at (0, 20), (10, 20); identified as A the first is exact, the second is off by (10, 0)
     poses = {"a": T, "b": T, "c": None}
     result = judge(poses, dict.fromkeys("abc", T), lights={"a": [0], "b": [-1, 0], "c": [0]})
     assert_close(result["residual_rms_px"], np.sqrt(10.0**2 / 4), atol=1e-4)

@@ -239,7 +239,7 @@ def check_approach(result):
     assert rear["last_z_m"] == pytest.approx(-3.0, abs=0.1)
     assert result["longest_gap_s"] <= 0.45
     assert result["layers"]["offset_m"] < 0.3
-    assert result["labels"]["wrong"] <= 0.002 * result["labels"]["named"]
+    assert result["identities"]["wrong"] <= 0.002 * result["identities"]["identified"]
 
 
 @pytest.mark.parametrize("seed", [31])
@@ -261,7 +261,7 @@ def test_rendered_approach_on_more_seeds(tmp_path, seed):
 
 
 def test_rectangular_search_is_named_right(tmp_path):
-    eligible, right = images.search_labels(*images.simulate_and_run("rectangle", 30, tmp_path))
+    eligible, right = images.search_identities(*images.simulate_and_run("rectangle", 30, tmp_path))
     assert eligible > 40
     assert right == eligible
 

@@ -14,7 +14,7 @@ from test_run import CAMERA, simulate
 from lumidock.datatypes import Fix, Frame
 from lumidock.picture import encoding_of
 from lumidock.station import load_station
-from lumidock.streams.sinks import Scene, open_file_sink
+from lumidock.streams.sinks import Setting, open_file_sink
 from lumidock.streams.sources import open_source
 
 
@@ -96,7 +96,7 @@ def test_what_is_shown_of_a_mosaic_has_its_colors(tmp_path, kind):
     mosaic = np.zeros((256, 320), np.uint16)
     mosaic[1::2, 0::2] = 60000  # of bayer_grbg
     frame, path = Frame("a", 1, mosaic, encoding="bayer_grbg16"), tmp_path / f"shown{kind}"
-    sink = open_file_sink(path, Scene(load_station(Path("src/lumidock/stations/cage-2x2x5.yaml")), CAMERA))
+    sink = open_file_sink(path, Setting(load_station(Path("stations/cage-2x2x5.yaml")), CAMERA))
     sink.add(frame, Fix("a", 1, "none", "search", reason="no_lights"), 1)
     sink.close()
     (shown,) = open_source(path).items()

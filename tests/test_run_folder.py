@@ -22,7 +22,7 @@ COLUMNS = (
 )
 HALF = np.sqrt(0.5)
 T_DOCK_CAM = pose_from_quat(np.array([1.0, -2.0, 10.0]), np.array([HALF, 0.0, 0.0, HALF]))
-SPOTS = Detections(
+DETECTIONS = Detections(
     "f1",
     5,
     np.array([[10.5, 20.25], [30.0, 40.0]]),
@@ -39,7 +39,7 @@ FIX = Fix(
     n_seen=2,
     n_used=1,
     T_dock_cam=T_DOCK_CAM,
-    match=Match(SPOTS, np.array([1, -1])),
+    match=Match(DETECTIONS, np.array([1, -1])),
     by_layer=(LayerPose("front", T_DOCK_CAM, 1, "pso"),),
 )
 LOST = Fix("f2", 0, "none", "search", reason="bad_frame")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from commandline import wait_for
 
-from lumidock.app.serve import Camera, Done, Newest, Server, Taken, Worker
+from lumidock.app.serve import Done, Newest, Server, SourceReader, Taken, Worker
 from lumidock.datatypes import Fix, Frame
 from lumidock.streams.healthpage import HealthPage
 
@@ -156,7 +156,7 @@ class Still:
 
 def server(items, workers, **options):
     stop, newest = threading.Event(), Newest()
-    camera = Camera(items, newest, **({"live": False, "loop": False, "stop": stop} | options))
+    camera = SourceReader(items, newest, **({"live": False, "loop": False, "stop": stop} | options))
     return Server(Still(), camera, newest, workers, stop)
 
 

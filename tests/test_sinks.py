@@ -21,7 +21,7 @@ from lumidock.streams.export import export
 from lumidock.streams.mp4 import Mp4
 from lumidock.streams.replay import read_fixes
 from lumidock.streams.run_folder import RunFolder
-from lumidock.streams.sinks import Scene, open_file_sink
+from lumidock.streams.sinks import Setting, open_file_sink
 from lumidock.streams.sources import open_source
 from lumidock.streams.vehicle import load_vehicle
 
@@ -226,7 +226,7 @@ def test_a_run_folder_reads_back_as_the_fixes_it_was_written_from(rng, sequence,
 
 
 def test_a_frame_without_a_stamp_is_left_out(sequence, tmp_path):
-    scene = Scene(load_station(sequence / "station.yaml"), CAMERA)
+    scene = Setting(load_station(sequence / "station.yaml"), CAMERA)
     for suffix in ("mcap", "rrd"):
         sink = open_file_sink(tmp_path / f"a.{suffix}", scene)
         sink.add(Unusable("x", None, "bad_stamp", ""), Fix("x", 0, "none", "search", reason="bad_stamp"), None)

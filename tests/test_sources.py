@@ -14,7 +14,7 @@ from lumidock.streams.sources import open_source
 
 PICTURES = np.random.default_rng(2).integers(0, 256, (4, 6, 8, 3), np.uint8)
 HEADER = b"frame,file,t_ns\n"
-SPOTS = "frame,u_px,v_px,radius_px,flux,p_light,p_rear\n"
+COLUMNS = "frame,u_px,v_px,radius_px,flux,p_light,p_rear\n"
 
 
 def write_pictures(folder, names):
@@ -245,7 +245,7 @@ def detections(tmp_path):
     """A folder of bare detections for frames 1 and 2; returns (rows of detections.csv) -> items."""
     (tmp_path / "timestamps.csv").write_bytes(HEADER + b"1,,5\n2,,6\n")
 
-    def items(rows, header=SPOTS):
+    def items(rows, header=COLUMNS):
         (tmp_path / "detections.csv").write_text(header + rows)
         return list(open_source(tmp_path).items())
 
@@ -286,7 +286,7 @@ def sigmas(tmp_path):
         (tmp_path / "attitude.csv").write_text(header + "".join(f"{row}\n" for row in rows))
         stamps = (f"{number},,{t * 1_000_000}\n" for number, t in enumerate(ms))
         (tmp_path / "timestamps.csv").write_text(HEADER.decode() + "".join(stamps))
-        (tmp_path / "detections.csv").write_text(SPOTS + "0,1,2,,,,\n")
+        (tmp_path / "detections.csv").write_text(COLUMNS + "0,1,2,,,,\n")
         items = list(open_source(tmp_path).items())
         return [item.attitude and item.attitude.sigma_rad for item in items]
 

@@ -9,11 +9,12 @@ from conftest import assert_close
 from lumidock.camera import load_camera
 from lumidock.cli.shared import shipped_or_path
 from lumidock.config import Config
-from lumidock.evaluation.station_check import Limits, inspect_station, visible_lights
+from lumidock.evaluation.station_check import Requirements, head_on, in_view, inspect_station
 from lumidock.station import load_station
 
-LIMITS = Limits(1.5, 4, 20.0)
+REQUIRED = Requirements(1.5, 4, 20.0)
 CAGE = shipped_or_path("station", "cage-2x2x5")
+FOUR = [[-0.5, 0.4], [0.5, 0.3], [0.4, -0.4], [-0.3, -0.45]]
 LENS = load_camera(shipped_or_path("camera", "imx264-60deg"))
 
 
@@ -23,21 +24,15 @@ def dock(path, positions, layer="front", **more):
     return load_station(path)
 
 
-def head_on(z):
-    T = np.diag([1.0, -1, -1, 1])
-    T[2, 3] = z
-    return T
-
-
 def test_lights_are_seen_inside_the_picture_and_their_beams(tmp_path):
     station = dock(tmp_path / "a.yaml", [[0, 0, 0], [1, 0, 0], [0, 1, 0], [20, 0, 0]], beam_deg=60.0)
-    assert visible_lights(station, LENS, head_on(10.0)).tolist() == [0, 1, 2]
-    assert visible_lights(station, LENS, head_on(1.0)).tolist() == [0]  # the others shine past the camera
-    assert visible_lights(station, LENS, head_on(-1.0)).tolist() == []
+    assert in_view(station, LENS, head_on(10.0)).lights.tolist() == [0, 1, 2]
+    assert in_view(station, LENS, head_on(1.0)).lights.tolist() == [0]  # the others shine past the camera
+    assert in_view(station, LENS, head_on(-1.0)).lights.tolist() == []
 
 
 def test_the_shipped_cage_passes_and_its_levels_are_those_of_the_lights():
-    result = inspect_station(load_station(CAGE), LENS, Config(), LIMITS)
+    result = inspect_station(load_station(CAGE), LENS, Config(), REQUIRED)
     assert result["failed"] == []
     assert result["layers"] == {"front": 7, "rear": 6}
     rows = {row["z_m"]: row for row in result["corridor"]}
@@ -45,26 +40,58 @@ def test_the_shipped_cage_passes_and_its_levels_are_those_of_the_lights():
     assert (rows[18]["stage"], rows[-1]["stage"]) == ("transition", "rear")
     assert rows[3]["lateral_m"] < rows[10]["lateral_m"] < rows[30]["lateral_m"]
     four = next(row for row in result["confusions"] if (row["layer"], row["seen"]) == ("front", 4))
-    assert_close(four["naming_px"], four["naming_m"] * 2087.0 / 18.0, atol=0.1)
+    assert_close(four["assignment_px"], four["assignment_m"] * 2087.0 / 18.0, atol=0.1)
 
 
 def test_a_square_of_lights_fails_for_its_mirror_image(tmp_path):
     station = dock(tmp_path / "a.yaml", [[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
-    failed = inspect_station(station, LENS, Config(), LIMITS)["failed"]
-    assert any("mirror image of 4 lights fits within 0.00 px" in text for text in failed)
+    failed = inspect_station(station, LENS, Config(), REQUIRED)["failed"]
+    assert any("mirror image of L0 L1 L2 L3 taken for" in text and "fits within 0.00 px" in text for text in failed)
 
 
 def test_a_wide_dock_goes_dark_up_close(tmp_path):
     wide = [[3, 2.7, 0], [-3, 2.2, 0], [-2.6, -2.4, 0], [3.1, -1.9, 0], [0.7, 2.9, 0]]
-    failed = inspect_station(dock(tmp_path / "a.yaml", wide), LENS, Config(), LIMITS)["failed"]
+    failed = inspect_station(dock(tmp_path / "a.yaml", wide), LENS, Config(), REQUIRED)["failed"]
     assert any("fewer than 4 lights" in text and " 1.5" in text for text in failed)
+
+
+def test_a_warning_says_which_lights_are_missing_and_why(tmp_path):
+    positions = [[0.1, 0.1, 0], [-0.2, 0.1, 0], [0.1, -0.2, 0], [4, 0, 0]]
+    path = tmp_path / "a.yaml"
+    lights = [{"id": f"L{i}", "layer": "front", "position": p} for i, p in enumerate(positions)]
+    lights[2] |= {"axis": [0, 1, 0.1], "beam_deg": 30}
+    path.write_text(yaml.safe_dump({"schema": 1, "name": "made", "docking_point": [0, 0, 2], "lights": lights}))
+    failed = inspect_station(load_station(path), LENS, Config(), Requirements(0.0, 4, 5.0))["failed"]
+    (text,) = [text for text in failed if "in view" in text]
+    assert text.endswith("at 5 m: L0 L1 seen, L3 outside the image, L2 shining past the camera")
+
+
+def test_the_approach_ends_at_the_docking_point(tmp_path):
+    for end in (2.25, 0.0, -1.5):
+        path = tmp_path / "a.yaml"
+        lights = [{"id": f"L{i}", "layer": "only", "position": [x, y, 0]} for i, (x, y) in enumerate(FOUR)]
+        path.write_text(yaml.safe_dump({"schema": 1, "name": "a", "docking_point": [0, 0, end], "lights": lights}))
+        rows = inspect_station(load_station(path), LENS, Config(), REQUIRED)["corridor"]
+        assert rows[-1]["z_m"] == end
+        assert {row["stage"] for row in rows} <= {"front", "search"}  # a lone layer is no rear layer
+        dark = [row for row in rows if not any(row["lights"].values())]
+        assert bool(dark) == (end < 1.0)  # nearer than that the lights are outside the image
+        assert not any(row["valid"] or row["lateral_m"] for row in dark)
+
+
+def test_the_stations_own_alert_limits_decide_what_is_valid(tmp_path):
+    text = CAGE.read_text() + "alert_limits: [{below_z_m: 100, lateral_m: 0.001, axial_m: 0.001, angle_deg: 0.1}]\n"
+    (tmp_path / "strict.yaml").write_text(text)
+    result = inspect_station(load_station(tmp_path / "strict.yaml"), LENS, Config(), REQUIRED)
+    assert not any(row["valid"] for row in result["corridor"])
+    assert "z < 100 m: lateral 0.001 m" in result["alert_limits"]
 
 
 def test_many_lights_are_looked_at_in_bounded_time(tmp_path):
     rng = np.random.default_rng(4)
     station = dock(tmp_path / "a.yaml", np.column_stack([rng.uniform(-1, 1, (30, 2)), np.zeros(30)]))
-    rows = inspect_station(station, LENS, Config(), LIMITS)["confusions"]
-    assert rows[-1]["naming_m"] is None
+    rows = inspect_station(station, LENS, Config(), REQUIRED)["confusions"]
+    assert rows[-1]["assignment_m"] is None
 
 
 def test_the_command_draws_and_its_exit_code_serves_a_build(lumidock, tmp_path):

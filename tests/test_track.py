@@ -347,4 +347,4 @@ def test_names_that_do_not_hold_together_have_a_large_surprise():
     wrong = track.start(T_cam_dock, swapped, 0, spots_at(uv), PLAN, PRIOR, slow, CONFIG.track)
     right = track.start(T_cam_dock, named(BOTH), 0, spots_at(uv), PLAN, PRIOR, slow, CONFIG.track)
     assert right.surprise < 0.0
-    assert wrong is None or wrong.surprise > CONFIG.track.max_surprise
+    assert wrong is None or wrong.surprise > CONFIG.track.max_deviate

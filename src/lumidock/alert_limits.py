@@ -98,10 +98,22 @@ class AlertLimits:
             axis=-1,
         )
         for band in reversed(self.bands):
-            limits = np.where(
-                (z < band.below_z_m)[..., None], [band.lateral_m, band.axial_m, band.angle_rad], limits
-            )
+            limits = np.where((z < band.below_z_m)[..., None], [band.lateral_m, band.axial_m, band.angle_rad], limits)
         return limits
+
+    def as_text(self) -> str:
+        """The limits in one line, for people."""
+        last, guide = self.bands[-1], self.guide
+        parts = [
+            f"z < {band.below_z_m:g} m: lateral {band.lateral_m:g} m, axial {band.axial_m:g} m, "
+            f"{math.degrees(band.angle_rad):.3g} deg"
+            for band in self.bands
+        ]
+        far_deg = math.degrees(max(_FAR_RAD, last.angle_rad))
+        parts.append(f"beyond: {_FAR_SHARE:.0%} of z but not less than before, {far_deg:.3g} deg")
+        near = f"guide from {guide.from_m:.3g} m on: bearing {math.degrees(guide.bearing_rad):.3g} deg"
+        parts.append(f"{near}, range {guide.range_share:.0%} but not less than {guide.range_m:.3g} m")
+        return "; ".join(parts)
 
     def applies_to_guide(self, bearing_x_rad: float, near_end_m: float) -> bool:
         """Whether a guide has limits of its own: the dock lies ahead, and even the near end of its range is far."""

@@ -24,13 +24,13 @@ def _rising(bounds: tuple[float, float]) -> tuple[float, float]:
 Bounds = Annotated[tuple[float, float], AfterValidator(_rising)]
 
 
-class Section(BaseModel):
-    """A frozen group of settings."""
+class SettingsGroup(BaseModel):
+    """A frozen group of settings; the comment beside a field is its documentation (`lumidock config dump`)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class ExtractConfig(Section):
+class ExtractConfig(SettingsGroup):
     """Light extraction, paper section 3.1.1."""
 
     gray: Literal["max", "luma"] = "max"  # luma weighs blue by 0.114 and loses the rear layer
@@ -51,7 +51,7 @@ class ExtractConfig(Section):
     )
 
 
-class LayersConfig(Section):
+class LayersConfig(SettingsGroup):
     """Layer discrimination, paper section 3.1.2."""
 
     method: Literal["auto", "color", "radius"] = "auto"  # auto: colour where the frame has any
@@ -64,7 +64,7 @@ class LayersConfig(Section):
     dual_frames: PositiveInt = 5  # T_cnt
 
 
-class PsoConfig(Section):
+class PsoConfig(SettingsGroup):
     """Enhanced particle swarm, paper section 3.2.1."""
 
     particles: Effort = 80
@@ -79,8 +79,8 @@ class PsoConfig(Section):
         12.0,
     )  # the paper's (0.5, 8) and (-1, 1) bear a stray light at the picture's edge
     shift: Bounds = (-2.0, 2.0)  # from 18.64 m on; from 30 m it takes more
-    residual: Literal["one_to_one", "all_pairs"] = "one_to_one"  # eq. (2) prints the sum over all pairs, which has no
-    # minimum at the alignment
+    # eq. (2) prints the sum over all pairs, which has no minimum at the alignment
+    residual: Literal["one_to_one", "all_pairs"] = "one_to_one"
     w1: PositiveFloat = 1.0  # eq. (8), this frame's residual
     w2: Annotated[float, Field(ge=0.0)] = 0.3  # eq. (8), distance from the previous frame
     penalty: Annotated[float, Field(ge=0.0)] = 0.5  # eq. (7)
@@ -88,14 +88,14 @@ class PsoConfig(Section):
     seed: NonNegativeInt = 0
 
 
-class ConsistencyConfig(Section):
+class ConsistencyConfig(SettingsGroup):
     """Distance and angle ratios, paper section 3.2.2."""
 
     ratio: PositiveFloat = 0.10  # eq. (9), relative
     angle_deg: PositiveFloat = 5.0  # eq. (10)
 
 
-class BtekfConfig(Section):
+class BtekfConfig(SettingsGroup):
     """Backtracking EKF, paper section 3.2.3."""
 
     noise_in_gate: bool = True  # eq. (11), (12) print the gate without measurement noise
@@ -113,13 +113,13 @@ class BtekfConfig(Section):
     max_gap_s: PositiveFloat = 2.0  # older history is forgotten
 
 
-class PoseConfig(Section):
+class PoseConfig(SettingsGroup):
     """When a layer's pose is believed, paper section 3.3."""
 
     max_rms_px: PositiveFloat = 6.0  # of the reprojection
 
 
-class PaperConfig(Section):
+class PaperConfig(SettingsGroup):
     """The paper's method."""
 
     extract: ExtractConfig = ExtractConfig()
@@ -132,7 +132,7 @@ class PaperConfig(Section):
     pose: PoseConfig = PoseConfig()
 
 
-class DetectConfig(Section):
+class DetectConfig(SettingsGroup):
     """Light detection of the default method; figures without a source were set on rendered approaches."""
 
     contrast: PositiveFloat = 1.9  # sigmas by which a tile's largest pixel must clear that of the tiles around
@@ -165,98 +165,102 @@ class DetectConfig(Section):
     drift_px_s: PositiveFloat = 400.0  # a lamp moves no faster over the picture, or counts as new
 
 
-class LabelConfig(Section):
-    """Front or rear by colour: the rear lights are blue, the front ones white."""
+class LabelConfig(SettingsGroup):
+    """Front or rear layer by colour: the rear lights are blue, the front ones white."""
 
     gamma: PositiveFloat = 2.2  # of the camera; ratios of colours mean something only in linear light
     clear_px: PositiveFloat = 3.0  # beyond a saturated core's edge, where clipping and demosaicing make it white
-    ring: tuple[PositiveFloat, PositiveFloat] = (1.5, 6.0)  # its colour is read up to this many radii + px
-    min_reach_px: PositiveFloat = 2.0  # other spots are read whole, small ones to here
-    blue_ratio: PositiveFloat = 1.2  # blue over the larger of green and red, where both layers are as likely
-    softness: PositiveFloat = 0.2  # of the logarithm of that ratio, without any noise
-    min_signal: PositiveFloat = 3.0  # sigmas of the ring's noise below which nothing is known
+    ring: tuple[PositiveFloat, PositiveFloat] = (1.5, 6.0)  # the colour is read up to this many radii + px
+    min_reach_px: PositiveFloat = 2.0  # radius within which small unsaturated blobs are read whole
+    blue_ratio: PositiveFloat = 1.2  # blue over the larger of green and red, at which both layers are as likely
+    softness: PositiveFloat = 0.2  # 1 sigma of the logarithm of that ratio, without any pixel noise
+    min_signal: PositiveFloat = 3.0  # sigmas of the ring's noise; with less signal the layer stays unknown
     limit: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.03  # p_rear stays this far from 0 and 1
 
 
-class PriorConfig(Section):
-    """Attitude of the camera about head-on where no sensor gives it, 1 sigma."""
+class PriorConfig(SettingsGroup):
+    """Prior of the camera's attitude about head-on where no sensor measures it, 1 sigma."""
 
     roll_deg: PositiveFloat = 10.0
     pitch_deg: PositiveFloat = 15.0
     yaw_deg: PositiveFloat = 15.0
 
 
-class MatchConfig(Section):
-    """Cold start: the evidence and the decision."""
+class MatchConfig(SettingsGroup):
+    """Acquisition: the evidence of an association, and when it decides."""
 
-    noise_px: PositiveFloat = 0.5  # of a centre that comes without a covariance
-    strange: Fraction = 0.5  # 1 sigma, of its radius, of the centre of a spot that is all but surely no lamp
+    noise_px: PositiveFloat = 0.5  # 1 sigma of a centroid that comes without a covariance
+    unlikely_radii: Fraction = 0.5  # 1 sigma of a centroid, in blob radii, as the blob's p_light goes to 0
     detect: Annotated[float, Field(gt=0, lt=1)] = 0.8  # probability that a light in view is detected
-    layer_absent: Annotated[float, Field(gt=0, lt=1)] = 0.3  # that a layer is not seen at all
-    steady: Annotated[float, Field(ge=0, lt=1)] = 0.7  # share of vehicles that hold head-on better than the prior ...
-    steadier: PositiveFloat = 7.0  # ... by this factor; without an attitude sensor
-    label_trust: Fraction = 0.6  # p_rear counts this much; a label of 0.95 becomes 0.77
-    spurious: PositiveFloat = 5.0  # mean number of spurious spots
-    clutter_near: Fraction = 0.02  # share of spurious spots that stand as close as the detections do
-    clutter_margin_px: PositiveFloat = 100.0
-    gate: PositiveFloat = 18.4  # chi-square, 2 dof, 1e-4
-    pair_gate: PositiveFloat = 11.8  # of a light that two others and the attitude prior place; 2 dof, 0.3 %
-    bend: PositiveFloat = 0.7  # a tilt of variance s foreshortens by this times s, 1 sigma
-    roll_gate: PositiveFloat = 3.3  # sigma of the prior
-    near_m: PositiveFloat = 0.3
-    far_m: PositiveFloat = 40.0  # of a light
-    hypotheses: PositiveInt = 64
-    least_detections: PositiveInt = 16  # of more detections only the likeliest lamps are looked at, ...
-    detections_per_light: PositiveInt = 2  # ... so many, or this times the station's lights
-    max_pairs: PositiveInt = 40_000  # pairs looked at in a frame, some 1.5 us each; a frame that wants more is refused
+    layer_absent: Annotated[float, Field(gt=0, lt=1)] = 0.3  # probability that a whole layer is not seen
+    # share of vehicles whose attitude is closer to head-on than the prior by the factor `steadier`; without a sensor
+    steady: Annotated[float, Field(ge=0, lt=1)] = 0.7
+    steadier: PositiveFloat = 7.0
+    label_trust: Fraction = 0.6  # weight of p_rear against 0.5: a p_rear of 0.95 counts as 0.77
+    spurious: PositiveFloat = 5.0  # mean number of spurious detections in an image
+    clutter_near: Fraction = 0.02  # share of spurious detections that lie as close together as the lights do
+    clutter_margin_px: PositiveFloat = 100.0  # around the projected lights, within which such detections count
+    gate: PositiveFloat = 18.4  # squared Mahalanobis distance: chi-square, 2 dof, exceeded with 1e-4
+    pair_gate: PositiveFloat = 11.8  # the same for a light predicted from two others and the attitude; 0.3 %
+    bend: PositiveFloat = 0.7  # a tilt of variance s shortens the array by a share of this times s, 1 sigma
+    roll_gate: PositiveFloat = 3.3  # sigmas of the prior by which a candidate may be rolled
+    near_m: PositiveFloat = 0.3  # least and ...
+    far_m: PositiveFloat = 40.0  # ... greatest distance of a light
+    hypotheses: PositiveInt = 64  # kept while lights are added to them
+    # of more detections only the likeliest lamps are considered: so many, or `detections_per_light` times the lights
+    least_detections: PositiveInt = 16
+    detections_per_light: PositiveInt = 2
+    max_pairs: PositiveInt = 40_000  # of detections, 1.5 us each; a frame that needs more is refused: `too_many`
     log_dock: float = 2.0  # log prior odds that the dock is in view at all
-    max_detections_three: PositiveInt = 14  # among more, three lights of a layer say nothing
-    sure: PositiveFloat = 15.0  # log evidence above which three lights of each layer need not be looked for
-    margin: PositiveFloat = 6.9  # log odds of the names on one frame, ln 1000
-    margin_gathered: PositiveFloat = 9.2  # over frames, or with three lights; of names that one frame alone may prove
-    lead: PositiveFloat = 3.5  # log odds by which a naming gathered over frames must lead in the last one alone
-    min_layer: PositiveInt = 3  # fewer lights of a second layer stay unnamed without history: they would set the tilt
-    enough: PositiveInt = 4  # names that let the doubtful ones be dropped
-    extra: PositiveFloat = 7.5  # log odds of a name that a lock does not need
-    prune: PositiveFloat = 5.0  # log odds below which a single name is dropped in any case
-    keep: PositiveFloat = 14.0  # candidates this far below the best are forgotten
-    log_mirror: float = -8.1  # log prior of seeing the mirror image alone
+    max_detections_three: PositiveInt = 14  # among more detections, three lights of a layer identify nothing
+    sure: PositiveFloat = 15.0  # log evidence above which associations of three lights a layer are not searched for
+    margin: PositiveFloat = 6.9  # log odds of an association that one frame decides, ln 1000
+    margin_gathered: PositiveFloat = 9.2  # the same gathered over frames, or with three lights; ln 10,000
+    lead: PositiveFloat = 3.5  # log odds by which a gathered hypothesis must also lead in the last frame alone
+    min_layer: PositiveInt = 3  # lights of a second layer; fewer are not identified, since they would set the tilt
+    enough: PositiveInt = 4  # identified lights, with which the doubtful ones may be dropped
+    extra: PositiveFloat = 7.5  # log odds of an identified light beyond those four
+    prune: PositiveFloat = 5.0  # log odds below which an identified light is dropped in any case
+    keep: PositiveFloat = 14.0  # log evidence behind the best at which a hypothesis is dropped
+    log_mirror: float = -8.1  # log prior of seeing only the mirror image of the dock
 
 
-class TrackConfig(Section):
-    """The filter with history."""
+class TrackConfig(SettingsGroup):
+    """Tracking: the filter's motion model, association and hypotheses."""
 
-    accel_m_s2: PositiveFloat = 0.3  # white noise on the twist: what a second adds to it, 1 sigma
-    accel_rad_s2: PositiveFloat = 0.05
-    start_m_s: PositiveFloat = 1.5  # 1 sigma of the unknown twist at the start
-    start_rad_s: PositiveFloat = 0.15
-    gate: PositiveFloat = 18.4  # chi-square, 2 dof, 1e-4
-    reach: PositiveFloat = 10.0  # log evidence; namings farther behind the best are not followed
-    max_nodes: PositiveInt = 100_000  # of the association's search, 0.1 us each; a belief that wants more is dropped
+    accel_m_s2: PositiveFloat = 0.3  # white noise on the velocity: what a second adds to it, 1 sigma
+    accel_rad_s2: PositiveFloat = 0.05  # the same on the rotation rate
+    start_m_s: PositiveFloat = 1.5  # 1 sigma of the unknown velocity at the start
+    start_rad_s: PositiveFloat = 0.15  # 1 sigma of the unknown rotation rate at the start
+    gate: PositiveFloat = 18.4  # squared Mahalanobis distance: chi-square, 2 dof, exceeded with 1e-4
+    reach: PositiveFloat = 10.0  # log evidence behind the best at which an association is not followed
+    max_nodes: PositiveInt = (
+        100_000  # of the association's search, 0.1 us each; a hypothesis that needs more is dropped
+    )
     log_appear: float = -6.9  # log prior that a layer comes into view in one frame
     joint_lights: PositiveInt = 3  # of each of two layers, before survey and calibration are estimated
-    max_gap_s: PositiveFloat = 2.0  # without lights; after it only survey and calibration are kept
-    max_surprise: PositiveFloat = 4.0  # of one frame's innovation, as a standard normal deviate
-    max_strain: PositiveFloat = 3.5  # of its running mean
-    strain_memory: Fraction = 0.8  # of that mean, a frame
-    beliefs: PositiveInt = 32  # poses or namings followed side by side
-    forget: PositiveFloat = 16.0  # log odds at which one is given up
+    max_gap_s: PositiveFloat = 2.0  # without lights; after it only the calibration states are kept
+    max_deviate: PositiveFloat = 4.0  # of one frame's NIS, as a standard normal deviate
+    max_mean_deviate: PositiveFloat = 3.5  # of the running mean of that deviate
+    deviate_memory: Fraction = 0.8  # share of the running mean that is kept from frame to frame
+    hypotheses: PositiveInt = 32  # poses or associations followed side by side
+    forget: PositiveFloat = 16.0  # log odds behind the best at which one of them is dropped
 
 
-class IntegrityConfig(Section):
+class IntegrityConfig(SettingsGroup):
     """When a pose may be used."""
 
-    risk: PositiveFloat = 1e-6  # of a frame
-    fault: PositiveFloat = 1e-5  # prior probability that a named light is wrong; in campaigns of proven tracks 2e-6
-    separate_from: PositiveInt = 6  # lights for one-fault solution separation
-    evidence: PositiveFloat = 13.8  # log odds that stand for the risk, where too few lights can check each other
-    carried_frames: PositiveInt = 2  # frames of four lights or more in a row that stand for it as well
-    gathered_frames: PositiveInt = 15  # the same for names that no single frame could decide
-    max_age_s: PositiveFloat = 0.3  # of the last light
+    risk: PositiveFloat = 1e-6  # probability in a frame that an error exceeds its protection level
+    fault: PositiveFloat = 1e-5  # prior probability that an identified light is wrong; 2e-6 in campaigns
+    separate_from: PositiveInt = 6  # lights, from which the solution is separated for one faulty light
+    evidence: PositiveFloat = 13.8  # log odds that meet the risk where too few lights check each other, -ln 1e-6
+    carried_frames: PositiveInt = 2  # frames in a row with four lights or more that agree, which meet it as well
+    gathered_frames: PositiveInt = 15  # the same for an association that no single frame could decide
+    max_age_s: PositiveFloat = 0.3  # of the last detected light, up to which a fix is predicted
 
 
-class Config(Section):
-    """Everything; saved with every run."""
+class Config(SettingsGroup):
+    """All settings; saved with every run."""
 
     paper: PaperConfig = PaperConfig()
     prior: PriorConfig = PriorConfig()

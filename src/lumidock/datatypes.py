@@ -25,7 +25,7 @@ MatchSource = Literal["pso", "btekf"]
 def require_shape(name: str, array: np.ndarray, *shape: int | None) -> None:
     """Check an array's shape; `None` stands for any length.
 
-    Raises: DataError naming the array and both shapes.
+    Raises: DataError that states the array and both shapes.
     """
     have = getattr(array, "shape", None)
     if have == shape:

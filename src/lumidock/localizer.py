@@ -176,7 +176,7 @@ class Localizer:
         """The likeliest first, without those that are out of the question or the same as a likelier one."""
         beliefs = sorted(beliefs, key=lambda belief: -belief.log_weight)
         kept: list[Track] = []
-        for belief in beliefs[: self.config.track.beliefs]:
+        for belief in beliefs[: self.config.track.hypotheses]:
             far_behind = belief.log_weight < beliefs[0].log_weight - self.config.track.forget
             if not far_behind and not any(track.same(belief, other) for other in kept):
                 kept.append(belief)
@@ -257,7 +257,7 @@ class Localizer:
 
         A naming that this frame gives again starts anew from its pose now, with the weight that it has gathered.
         """
-        new = [*found.candidates, *found.others][: self.config.track.beliefs]
+        new = [*found.candidates, *found.others][: self.config.track.hypotheses]
         begun = [self._renew(naming, new, followed, detections, seen) for naming in new]
         others = [b for b in followed if not any((b.name == naming.name).all() for naming in new)]
         self.beliefs = self._likeliest([*others, *(belief for belief in begun if belief is not None)])

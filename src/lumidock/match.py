@@ -104,7 +104,7 @@ def plan(station: Station, camera: Camera, config: MatchConfig) -> Plan:
     rank, pairs, unseen = _pair_order(station)
     size = np.array([camera.width, camera.height]) / camera.focal_px
     volume = float(size.prod()) * config.far_m**3 / 3.0
-    is_rear = (behind == len(front_first) - 1).astype(np.int64)
+    is_rear = ((behind == len(front_first) - 1) & (behind > 0)).astype(np.int64)  # a lone layer is the front one
     return Plan(
         camera.lens(),
         np.ascontiguousarray(station.p_dock),
@@ -209,7 +209,7 @@ def spots(detections: Detections, plan: Plan, config: MatchConfig) -> Spots:
         cov = np.array(detections.cov_px2, np.float64, order="C")
     p_light, var, like = np.array(detections.p_light, np.float64), np.empty(n), np.empty((n, plan.n_layers))
     radius_px, p_rear = np.ascontiguousarray(detections.radius_px), np.ascontiguousarray(detections.p_rear)
-    strange = config.strange, _RADIUS_PX, _STRANGE
+    strange = config.unlikely_radii, _RADIUS_PX, _STRANGE
     span = kernel.weigh(uv, radius_px, p_rear, plan.is_rear, config.label_trust, strange, cov, p_light, like, var)
     whole, share = plan.lens[6] * plan.lens[7], config.clutter_near
     box = min(span + config.clutter_margin_px**2, whole) if n else whole

@@ -144,7 +144,9 @@ def _error_covariance(T_dock_cam: Array, station: Station, camera: Camera, light
     uv, J_uv_p = camera.project_with_jacobian(transform_points(T_cam_dock, station.p_dock[lights]))
     n, J_uv_dock = len(lights), J_uv_p @ T_cam_dock[:3, :3]
     together = station.layer[lights][:, None] == station.layer[lights][None, :]
-    position = np.diag(np.broadcast_to(station.sigma_light_m, len(station))[lights] ** 2) + together * station.sigma_layer_m**2
+    position = (
+        np.diag(np.broadcast_to(station.sigma_light_m, len(station))[lights] ** 2) + together * station.sigma_layer_m**2
+    )
     total = np.einsum("ij,iak,jbk->iajb", position, J_uv_dock, J_uv_dock).reshape(2 * n, 2 * n)
     offset = (uv - camera.center_px).ravel()
     total += np.outer(offset, offset) * station.sigma_focal**2

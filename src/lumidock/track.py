@@ -302,7 +302,7 @@ def update(
         plane,
         nis,
         surprise,
-        config.strain_memory * track.strain + math.sqrt(1.0 - config.strain_memory**2) * surprise,
+        config.deviate_memory * track.strain + math.sqrt(1.0 - config.deviate_memory**2) * surprise,
     )
 
 

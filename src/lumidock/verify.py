@@ -14,7 +14,7 @@ _MIN_LOCK, _MIN_GATHERED = 4, 3
 
 def innovation_holds(track: Track, config: TrackConfig) -> bool:
     """Whether the last frame's innovation, and that of the frames before, is as large as its covariance allows."""
-    return track.n_used > 0 and track.surprise < config.max_surprise and track.strain < config.max_strain
+    return track.n_used > 0 and track.surprise < config.max_deviate and track.strain < config.max_mean_deviate
 
 
 def is_answer(found: Acquisition, config: MatchConfig) -> bool:

@@ -106,7 +106,7 @@ def parse_mapping(text: str, path: Path) -> dict[str, Any]:
 def validate(model: type[Model], content: dict[str, Any], origin: str) -> Model:
     """Check `content` against a pydantic model.
 
-    Raises: InputError, one line naming `origin`, the place in it and what is wrong there; of an unknown key also the
+    Raises: InputError, one line with `origin`, the place in it and what is wrong there; of an unknown key also the
     nearest known one, and all keys of its section.
     """
     try:

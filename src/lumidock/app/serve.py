@@ -1,4 +1,4 @@
-"""Live guidance: the newest frame through the localizer to the vehicle, while everything slower drops what is old.
+"""Live guidance: the newest frame goes through the localizer to the vehicle, and slower consumers skip frames.
 
 One thread reads the camera into a slot that holds the newest frame only. The caller's thread localizes and offers the
 fix to the sinks, each of which has a thread and a short queue of its own, so that none can delay the next fix.
@@ -24,14 +24,14 @@ from lumidock.streams.sinks import Sink
 from lumidock.streams.sources import Item
 
 _RECENT = 1000  # frames that rates and latencies are taken over
-_TICK_S = 0.2  # between looks at a sink that has nothing to do
-_LOOK_S = 0.05  # that a recording waits at most for a picture to be looked at
+_TICK_S = 0.2  # after which a sink without frames is given a turn, for its heartbeats
+_LOOK_S = 0.05  # that a recording waits at most until a frame has been localized
 _RETRY_S = 1.0  # until a lost camera or a failed sink is tried again
-_AFTER_YOU_S = 0.01  # in which the vehicle is told, before what can wait takes the processor
+_YIELD_S = 0.01  # that sinks which can wait leave the processor to the one that tells the vehicle
 _OPENING_S = 2.0  # all sinks together may take before the first frame
 _CLOSING_S = 5.0  # a sink may take to write what is left
-_LOOP_PAUSE_NS = 3_000_000_000  # between two passes over a recording: no track is carried across
-STALE_S = 0.25  # ArduPilot takes an estimate for lost after 0.3
+_LOOP_PAUSE_NS = 3_000_000_000  # between two passes over a recording, longer than any track lives
+STALE_S = 0.25  # older fixes are not sent: ArduPilot declares an estimate lost after 0.3 s
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +69,12 @@ class Newest:
             return taken
 
     def wait_until_idle(self, timeout_s: float) -> None:
-        """Wait until whoever takes the frames has done with the last one."""
+        """Wait until the consumer has finished the last frame."""
         self._idle.wait(timeout_s)
 
 
-class Camera(threading.Thread):
-    """Reads a source into a slot, and opens it again when it is lost; a recording is shown at its own pace."""
+class SourceReader(threading.Thread):
+    """Reads a source into a slot, and opens it again when it is lost; a recording is read at its own pace."""
 
     def __init__(
         self, open_items: Callable[[], Iterator[Item]], newest: Newest, *, live: bool, loop: bool, stop: threading.Event
@@ -112,9 +112,9 @@ class Camera(threading.Thread):
             self.frames += 1
             self.problem = ""
             self._newest.put(_of_pass(item, self._passes, self._offset_ns))
-            if not self._live:  # a camera has no next picture to decode while this one is looked at
+            if not self._live:  # unlike a camera, a recording would decode its next image while this one is localized
                 self._newest.wait_until_idle(_LOOK_S)
-                self._halt.wait(_AFTER_YOU_S)
+                self._halt.wait(_YIELD_S)
         if self._loop and first_ns is not None:
             self._offset_ns += last_ns - first_ns + _LOOP_PAUSE_NS
             self._halt.wait(_LOOP_PAUSE_NS * 1e-9)
@@ -163,7 +163,7 @@ class Worker(threading.Thread):
     ) -> None:
         """Feed the sink that `open_sink` opens; without `pictures` it is given the frames' names and stamps alone.
 
-        A `patient` one, for people or for later, begins with a frame when the vehicle has been told.
+        A `patient` sink, a display or a recording, waits with each frame until the vehicle has been sent its fix.
         """
         super().__init__(name=name, daemon=True)
         self._open, self._queue, self._stale_s = open_sink, deque[Done](maxlen=queue), stale_s
@@ -208,7 +208,7 @@ class Worker(threading.Thread):
             return self._halt and not self._queue
 
     def _pause(self) -> None:
-        """Let a sink that failed rest; what is queued meanwhile is given up when it is time to end."""
+        """Wait before a sink that failed is opened again; its queue is dropped if the program ends meanwhile."""
         end = time.monotonic() + _RETRY_S
         with self._changed:
             while not self._halt and time.monotonic() < end:
@@ -227,8 +227,10 @@ class Worker(threading.Thread):
                     return
             tick()
             if done is not None:
-                if self._patient:  # not a lower priority: who then holds the interpreter keeps everybody waiting
-                    time.sleep(_AFTER_YOU_S)
+                if (
+                    self._patient
+                ):  # a lower thread priority would not help: the holder of the interpreter lock blocks all
+                    time.sleep(_YIELD_S)
                 self._send(sink, done)
 
     def _send(self, sink: Sink, done: Done) -> None:
@@ -244,10 +246,10 @@ class Worker(threading.Thread):
 
 @dataclass(slots=True)
 class Server:
-    """Camera, localizer and sinks, and what is known of their health."""
+    """Source reader, localizer and sinks, and their health."""
 
     localizer: Method
-    camera: Camera
+    camera: SourceReader
     newest: Newest
     workers: list[Worker]
     stop: threading.Event
@@ -262,11 +264,11 @@ class Server:
         """Localize the newest frame, over and over, until told to stop or the recording ends."""
         stage: Stage = "search"
         gc.collect()
-        gc.freeze()  # what is alive now stays, and would be looked at in every long pause of the collector
+        gc.freeze()  # objects alive now stay alive, and scanning them would lengthen every pause of the collector
         for worker in self.workers:
             worker.start()
         ready_s = time.monotonic() + _OPENING_S
-        for worker in self.workers:  # what is slow to open would be behind from the first frame on
+        for worker in self.workers:  # a sink that is slow to open would lag from the first frame on
             worker.tried.wait(max(0.0, ready_s - time.monotonic()))
         self.camera.start()
         try:

@@ -17,6 +17,7 @@ import typer
 from lumidock.camera import load_camera, save_camera
 from lumidock.cli import (
     calibration,
+    demo,
     doctoring,
     evaluation,
     exporting,
@@ -57,13 +58,14 @@ from lumidock.cli.shared import (
     require_folder,
     shipped_or_path,
     simulated,
+    told_at_interrupt,
 )
 from lumidock.config import Config, load_config
 from lumidock.datatypes import Fix
 from lumidock.errors import InputError, LumidockError
 from lumidock.methods import METHODS, localizer_of, require_method
 from lumidock.station import load_station
-from lumidock.streams.sources import Item, open_source
+from lumidock.streams.sources import Item
 
 _MAX_SEED = 10**9
 _COMMANDS = (
@@ -75,12 +77,13 @@ _COMMANDS = (
     calibration,
     stations,
     setting_up,
+    demo,
     doctoring,
 )  # importing them adds their commands
 
 
 def main() -> None:
-    """Entry point: every error that is the user's to mend is one line and exit code 2."""
+    """Entry point: every error that the user can correct is one line and exit code 2."""
     _keep_streams_clean()
     try:
         code = app(standalone_mode=False, prog_name="lumidock")
@@ -91,7 +94,7 @@ def main() -> None:
         sys.exit(130)
     except LumidockError as error:
         _fail(str(error))
-    except BrokenPipeError:  # whoever read our output has left
+    except BrokenPipeError:  # the program that read the output has ended
         _drop_output()
         sys.exit(1)
     except OSError as error:
@@ -101,7 +104,7 @@ def main() -> None:
 
 
 def _keep_streams_clean() -> None:
-    """Let any file name be printed, and the libraries below us not print at all."""
+    """Let any file name be printed, and silence the log messages of OpenCV and FFmpeg."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -110,7 +113,7 @@ def _keep_streams_clean() -> None:
 
 
 def _drop_output() -> None:
-    """Give up what cannot be written, or the interpreter would complain of it at its end."""
+    """Discard output that cannot be written, or the interpreter would report it when it ends."""
     try:
         print(end="", flush=True)
     except OSError:
@@ -182,7 +185,13 @@ def _run(
         camera_file.unlink(missing_ok=True)  # a link, not what it points to
         save_camera(lens, camera_file)
     setup = Setup(method, cold, settings, station_file, camera_file)
-    with RunFolder(out, dock.ids) as folder, progress_bar("run") as progress, interrupts_held() as let_interrupt:
+    left = f"{out} holds a complete row for every frame so far; `run` with --force begins again"
+    with (
+        told_at_interrupt(left),
+        RunFolder(out, dock.ids) as folder,
+        progress_bar("run") as progress,
+        interrupts_held() as let_interrupt,
+    ):
         copy(station_file, out / "station.yaml")
         copy(camera_file, out / "camera.yaml")
         done = count(1)
@@ -221,13 +230,16 @@ def _sim(
     ] = None,
     detections: Annotated[
         bool,
-        typer.Option("--detections", help="Bare detections, without rendering: path, faults and spots alone count."),
+        typer.Option(
+            "--detections", help="Bare detections, without rendering: only path, faults and detections count."
+        ),
     ] = False,
     video: Annotated[bool, typer.Option("--video", help="Pictures as video.mp4 instead of frames/.")] = False,
     workers: Workers = None,
     station: StationOption = None,
     camera: CameraOption = None,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Simulate SCENARIO into a sequence folder with truth."""
     from lumidock.sim.scenario import load_scenario
@@ -245,16 +257,20 @@ def _sim(
     if detections:
         frames = write_detections(loaded, dock, lens, seed, out)
     else:
-        with progress_bar("sim") as progress:
+        left = f"{out} holds an incomplete sequence, which `run` refuses; the same command with --force begins again"
+        with told_at_interrupt(left), progress_bar("sim") as progress:
             frames = write_rendered(loaded, dock, lens, seed, out, video=video, workers=workers, progress=progress)
-    print(f"{frames} frames written to {out}")
+    print(json.dumps({"frames": frames, "folder": str(out)}) if as_json else f"{frames} frames written to {out}")
 
 
 @app.command("campaign", epilog=example("lumidock campaign nominal --seeds 0:100 --out CAMPAIGN"))
 def _campaign(
     scenarios: Annotated[list[str], typer.Argument(metavar="SCENARIO", help=f"{SCENARIOS}, or .yaml files.")],
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder to write; the same campaign goes on where it was.")
+        Path,
+        typer.Option(
+            "--out", metavar="DIR", help="Folder to write; the same command continues an interrupted campaign."
+        ),
     ],
     seeds: Annotated[str, typer.Option(metavar="A:B", help="Seeds A to B - 1, a run of each scenario each.")] = "0:10",
     methods: Annotated[
@@ -269,14 +285,14 @@ def _campaign(
         str | None, typer.Option(metavar="ADDRESS", help="Run on the dask cluster there: tcp://HOST:PORT.")
     ] = None,
     bound: Annotated[
-        bool, typer.Option("--bound", help="Also count where the lights in view owe a valid fix (slower).")
+        bool, typer.Option("--bound", help="Also count in which frames the lights in view allow a valid fix (slower).")
     ] = False,
     station: StationOption = None,
     camera: CameraOption = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run scenarios x seeds x methods on bare detections, and count."""
+    """Run scenarios x seeds x methods on bare detections, and count availability, errors and hazards."""
     from lumidock.evaluation.campaign import plan, prepare, run_campaign, tabulate
     from lumidock.evaluation.campaign_table import markdown
     from lumidock.sim.scenario import load_scenario
@@ -293,7 +309,8 @@ def _campaign(
         bound=bound,
     )
     prepare(campaign, out, force=force)
-    with progress_bar("campaign") as progress:
+    left = f"{out} holds the finished shards; the same command continues with the others"
+    with told_at_interrupt(left), progress_bar("campaign") as progress:
         speed = run_campaign(campaign, out, workers=workers, cluster=cluster, progress=progress)
     table = tabulate(campaign, out)
     if as_json:
@@ -325,60 +342,3 @@ def _warm() -> None:
     for name, _ in warm_up(Localizer(dock, lens).process, dock, lens):
         print(f"ready for {name}", flush=True)
     print("kept in numba's cache")
-
-
-@app.command("demo", epilog=example("lumidock demo --force"))
-def _demo(
-    out: Out = Path("demo-out"),
-    seed: Seed = 0,
-    force: Force = False,
-) -> None:
-    """Simulate a docking, run it, and leave files and pictures."""
-    from lumidock.app.demo import Album, summary_lines
-    from lumidock.app.run import Setup
-    from lumidock.app.run import run as run_source
-    from lumidock.evaluation.metrics import evaluate, true_poses
-    from lumidock.localizer import Localizer
-    from lumidock.report import page, report
-    from lumidock.report.stills import contact_sheet, plot_trajectory
-    from lumidock.sim.scenario import load_scenario
-    from lumidock.sim.sequence import write_rendered
-    from lumidock.streams.run_folder import RunFolder
-
-    prepare_folder(out, force)
-    sequence, run_folder = out / "sequence", out / "run"
-    prepare_sequence(sequence, True)
-    scenario = load_scenario("approach")
-    station_file, camera_file = (
-        shipped_or_path("station", DEFAULT_STATION),
-        shipped_or_path("camera", DEFAULT_CAMERA),
-    )
-    dock, lens = load_station(station_file), load_camera(camera_file)
-    copy(station_file, sequence / "station.yaml")
-    with progress_bar("simulating") as progress:
-        write_rendered(scenario, dock, lens, seed, sequence, progress=progress)
-    source = open_source(sequence)
-    setup = Setup("lumidock", False, Config(), station_file, camera_file)
-    video = out / "annotated.mp4"
-    with (
-        RunFolder(run_folder, dock.ids) as folder,
-        progress_bar("localizing") as progress,
-        interrupts_held() as let_interrupt,
-        Album(dock, lens, video, 1.0 / scenario.path.frame_interval_s) as album,
-    ):
-
-        def on_fix(item: Item, fix: Fix) -> None:
-            album.add(item, fix)
-            progress(len(album.fixes), source.count)
-            let_interrupt()
-
-        copy(station_file, run_folder / "station.yaml")
-        copy(camera_file, run_folder / "camera.yaml")
-        summary = run_source(source, Localizer(dock, lens), folder, setup, on_fix=on_fix)
-    result = evaluate(run_folder, sequence)
-    plot_trajectory(album.fixes, true_poses(sequence), dock, out / "trajectory.png")
-    contact_sheet(album.sheet(), out / "stages.jpg")
-    page.write(out / "report.html", report([run_folder], [sequence]))
-    print("\n".join(summary_lines(result, summary.as_dict())))
-    shown = (out / "report.html", out / "trajectory.png", out / "stages.jpg", video, run_folder / "fixes.csv")
-    print(f"look at     {', '.join(map(str, shown))}")

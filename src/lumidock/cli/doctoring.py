@@ -6,8 +6,8 @@ import json
 from dataclasses import asdict
 
 import typer
-import yaml
 
+from lumidock.app.settings_text import as_yaml
 from lumidock.cli.shared import AsJson, ConfigOption, app, example
 from lumidock.config import Config, load_config
 
@@ -17,7 +17,7 @@ app.add_typer(config, name="config")
 
 @app.command("doctor", epilog=example("lumidock doctor", "lumidock doctor --json"))
 def _doctor(as_json: AsJson = False) -> None:
-    """Look at this machine; exit code 1 when something is in the way."""
+    """Check this machine; exit code 1 when something keeps lumidock from working."""
     from lumidock.app.doctor import examine
 
     findings = examine()
@@ -32,9 +32,9 @@ def _doctor(as_json: AsJson = False) -> None:
 
 @config.command("dump", epilog=example("lumidock config dump > all.yaml", "lumidock config dump --config mine.yaml"))
 def _dump(changes: ConfigOption = None) -> None:
-    """Print every setting, with your changes, as a file for --config."""
+    """Print every setting with its unit and meaning, and your changes, as a file for --config."""
     settings = load_config(changes) if changes else Config()
-    print(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False), end="")
+    print(as_yaml(settings), end="")
 
 
 @config.command("schema", epilog=example("lumidock config schema > lumidock.schema.json"))

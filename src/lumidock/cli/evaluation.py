@@ -78,11 +78,14 @@ def print_evaluation(result: dict[str, Any]) -> None:
             print(f"{layer}: {content['fixes']} fixes, z {content['first_z_m']:.2f} to {content['last_z_m']:.2f} m")
         elif content is not None:
             print(f"largest offset between the layers {content:.3f} m")
-    if "labels" in result:
-        print(f"names: {result['labels']['named']} given, {result['labels']['wrong']} wrong")
+    if counts := result.get("identities"):
+        print(
+            f"identities: {counts['identified']} detections identified; {counts['wrong']} wrong (another lit light is "
+            f"nearer), {counts['displaced']} more than 3 px from their light"
+        )
     if result.get("residual_rms_px") is not None:
-        print(f"named lights {result['residual_rms_px']:.2f} px rms from where the poses put them")
-    _print_trust(result)
+        print(f"identified lights {result['residual_rms_px']:.2f} px rms from where the poses put them")
+    _print_integrity(result)
 
 
 def _print_ranges(result: dict[str, Any]) -> None:
@@ -99,8 +102,8 @@ def _errors(row: dict[str, Any]) -> str:
     return "  ".join(f"{e['median']:6.3f} /{e['p95']:7.3f}" if e else f"{'-':>15}" for e in errors)
 
 
-def _print_trust(result: dict[str, Any]) -> None:
-    """What the run's own claims are worth."""
+def _print_integrity(result: dict[str, Any]) -> None:
+    """Whether alert limits, protection levels and covariances hold against the truth."""
     hazardous = result["hazardous"]
     for word in ("valid", "guide"):
         kinds = {kind: count for kind, count in hazardous[word].items() if kind != "any"}
@@ -112,11 +115,14 @@ def _print_trust(result: dict[str, Any]) -> None:
     nees = result["nees"]
     if nees["frames"]:
         stages = {stage: f"{mean['mean']:.2f}" for stage, mean in nees["by_stage"].items()}
-        print(f"NEES {nees['mean']:.2f} over {nees['frames']} frames, honest is 6: {_words(stages)}")
+        print(f"NEES {nees['mean']:.2f} over {nees['frames']} frames ({_words(stages)})")
+        print("  6 on average where covariances are right; more: too small; less: too wide, as where survey and")
+        print("  calibration are better than the station file states")
     if nis := result["nis"]:
-        print(f"NIS per degree of freedom {nis['mean']:.2f} over {nis['frames']} frames, honest is 1")
+        print(f"NIS per degree of freedom {nis['mean']:.2f} over {nis['frames']} frames")
+        print("  1 on average where the noise of the centroids is as stated")
     if nees["improper"]:
-        print(f"covariances that are none {nees['improper']}")
+        print(f"covariances that are not positive definite: {nees['improper']}")
 
 
 def _words(counts: dict[str, Any]) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from lumidock.cli.shared import (
+    AsJson,
     Force,
     Fps,
     Topic,
@@ -17,6 +19,7 @@ from lumidock.cli.shared import (
     interrupts_held,
     progress_bar,
     require_new,
+    told_at_interrupt,
 )
 from lumidock.streams.sources import open_source
 from lumidock.streams.vehicle import load_vehicle
@@ -41,6 +44,7 @@ def _export(
     topic: Topic = None,
     fps: Fps = None,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Turn RUN into a file for ROS 2, Rerun, video players or tables."""
     from lumidock.streams.export import export
@@ -48,11 +52,12 @@ def _export(
     require_new(target, force)
     opened = open_source(source, fps, topic=topic) if source else None
     mounting = load_vehicle(vehicle) if vehicle else None
-    with interrupts_held() as let_interrupt, progress_bar("export") as progress:
+    left = f"{target} is not written"
+    with told_at_interrupt(left), interrupts_held() as let_interrupt, progress_bar("export") as progress:
 
         def on_frame(done: int, total: int | None) -> None:
             progress(done, total)
             let_interrupt()
 
         frames = export(run, target, opened, mounting, progress=on_frame)
-    print(f"{frames} frames written to {target}")
+    print(json.dumps({"frames": frames, "file": str(target)}) if as_json else f"{frames} frames written to {target}")

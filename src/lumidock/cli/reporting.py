@@ -21,6 +21,7 @@ from lumidock.cli.shared import (
     progress_bar,
     require_new,
     shipped_or_path,
+    told_at_interrupt,
 )
 
 
@@ -45,15 +46,17 @@ def _report(
         ),
     ] = None,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Show how RUN went as one page that opens without network."""
+    """Write one HTML page about RUN that needs no network."""
     from lumidock.report import page, report
 
     require_new(out, force)
-    with progress_bar("report") as progress:
+    with told_at_interrupt(f"{out} is not written"), progress_bar("report") as progress:
         text = report(runs, sources or (), progress=progress)
     page.write(out, text)
-    print(f"{out}: {len(text.encode()) / 1e6:.1f} MB")
+    size = len(text.encode())
+    print(json.dumps({"file": str(out), "bytes": size}) if as_json else f"{out}: {size / 1e6:.1f} MB")
 
 
 @app.command(
@@ -65,7 +68,10 @@ def _report(
 )
 def _reproduce(
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder to write; the same command goes on where it was.")
+        Path,
+        typer.Option(
+            "--out", metavar="DIR", help="Folder to write; the same command continues an interrupted reproduction."
+        ),
     ],
     full: Annotated[bool, typer.Option("--full/--quick", help="Hours, or minutes (default).")] = False,
     workers: Workers = None,
@@ -78,7 +84,8 @@ def _reproduce(
     from lumidock.reproduce import FULL, QUICK, reproduce
 
     files = shipped_or_path("station", station or DEFAULT_STATION), shipped_or_path("camera", camera or DEFAULT_CAMERA)
-    with progress_bar("reproduce, s of work") as progress:
+    left = f"{out} holds the finished parts; the same command continues with the others"
+    with told_at_interrupt(left), progress_bar("reproduce, s of work") as progress:
         results = reproduce(FULL if full else QUICK, *files, out, force=force, workers=workers, progress=progress)
     if as_json:
         print(json.dumps(results, indent=1))

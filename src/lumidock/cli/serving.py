@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 import sys
@@ -15,11 +16,12 @@ from typing import Annotated
 
 import typer
 
-from lumidock.app.serve import STALE_S, Camera, Newest, Server, Worker
+from lumidock.app.serve import STALE_S, Newest, Server, SourceReader, Worker
 from lumidock.app.warm import warm_up
 from lumidock.camera import save_camera
 from lumidock.cli.shared import (
     SIM,
+    AsJson,
     Bits,
     CameraOption,
     ConfigOption,
@@ -44,7 +46,7 @@ from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
-from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Scene, open_rerun
+from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, open_rerun
 from lumidock.streams.vehicle import load_vehicle
 
 _LOOPBACK, _ENDPOINT = "127.0.0.1", re.compile(r"(tcp|udp|tls|quic)/[^/?#]+:[0-9]{1,5}")
@@ -113,8 +115,9 @@ def _serve(
     health_port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="Of the health page.")] = 8780,
     host: HostOption = _LOOPBACK,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Localize live and tell the vehicle, until stopped."""
+    """Localize live and send every fix to the vehicle, until stopped."""
     require_method(method)
     settings = load_config(config) if config else Config()
     mounting = load_vehicle(vehicle) if vehicle else None
@@ -126,25 +129,28 @@ def _serve(
         station_file = file_of("station", station, opened.station, opened)
         dock = load_station(station_file)
         lens = calibration_of(camera, opened)
-        scene = Scene(dock, lens, mounting)
+        setting = Setting(dock, lens, mounting)
         list(warm_up(localizer_of(method, dock, lens, settings).process, dock, lens))
         localizer = localizer_of(method, dock, lens, settings)
         sinks = [
-            *_vehicle_sinks(scene, mavlink, zenoh, domain if dds else None, domain, host),
-            *_viewer_sinks(scene, foxglove_port if foxglove else None, rerun, host),
-            *_file_sinks(scene, station_file, out, record or [], force),
+            *_vehicle_sinks(setting, mavlink, zenoh, domain if dds else None, domain, host),
+            *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
+            *_file_sinks(setting, station_file, out, record or [], force),
         ]
         sys.setswitchinterval(_SWITCH_S)
         stop, newest = threading.Event(), Newest()
-        reader = Camera(opened.items, newest, live=opened.live, loop=loop, stop=stop)
+        reader = SourceReader(opened.items, newest, live=opened.live, loop=loop, stop=stop)
         server = Server(localizer, reader, newest, sinks, stop)
         page = _health_page(host, health_port, server)
         stack.callback(page.close)
-        print(f"health at http://{host}:{page.port}/", flush=True)
+        print(f"health at http://{host}:{page.port}/", file=sys.stderr if as_json else sys.stdout, flush=True)
         with _stopped_by_signals(stop):
             server.serve()
     counts = server.counts
-    print(f"{counts['frames']} frames: {counts['valid']} valid; {newest.dropped} came too fast and were dropped")
+    if as_json:
+        print(json.dumps({**{word: counts[word] for word in ("frames", "valid", "guide")}, "dropped": newest.dropped}))
+    else:
+        print(f"{counts['frames']} frames: {counts['valid']} valid; {newest.dropped} came too fast and were dropped")
     if reader.problem and not opened.live:
         raise InputError(reader.problem)
 
@@ -159,7 +165,7 @@ def _health_page(host: str, port: int, server: Server) -> HealthPage:
 
 @contextmanager
 def _stopped_by_signals(stop: threading.Event) -> Iterator[None]:
-    """Let SIGTERM and Ctrl-C end the serving in good order."""
+    """Let SIGTERM and Ctrl-C end `serve` after the current frame, with every sink closed."""
     numbers = (signal.SIGTERM, signal.SIGINT)
     before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
     try:
@@ -170,17 +176,17 @@ def _stopped_by_signals(stop: threading.Event) -> Iterator[None]:
 
 
 def _vehicle_sinks(
-    scene: Scene, mavlink: str | None, zenoh: str | None, dds: int | None, domain: int, host: str
+    setting: Setting, mavlink: str | None, zenoh: str | None, dds: int | None, domain: int, host: str
 ) -> list[Worker]:
-    workers, shared = [], (scene.camera, scene.vehicle, scene.station.ids)
+    workers, shared = [], (setting.camera, setting.vehicle, setting.station.ids)
     if mavlink is not None:
-        if scene.vehicle is None:
+        if setting.vehicle is None:
             raise InputError("--mavlink needs --vehicle FILE: an autopilot wants the pose of the vehicle's body")
         with extra("mavlink"):
             from lumidock.streams.mavlink import Mavlink
         name, port = _host_and_port("--mavlink", mavlink)
         workers.append(
-            Worker("mavlink", partial(Mavlink, name, port, scene.vehicle), queue=1, stale_s=STALE_S, pictures=False)
+            Worker("mavlink", partial(Mavlink, name, port, setting.vehicle), queue=1, stale_s=STALE_S, pictures=False)
         )
     if zenoh is not None:
         if not _ENDPOINT.fullmatch(zenoh):
@@ -195,34 +201,36 @@ def _vehicle_sinks(
     return workers
 
 
-def _viewer_sinks(scene: Scene, foxglove_port: int | None, rerun: str | None, host: str) -> list[Worker]:
+def _viewer_sinks(setting: Setting, foxglove_port: int | None, rerun: str | None, host: str) -> list[Worker]:
     workers = []
     if foxglove_port is not None:
         with extra("live"), extra("bag"):
             from lumidock.streams.foxglovelive import FoxgloveLive
-        shared = (scene.camera, scene.vehicle, scene.station.ids)
+        shared = (setting.camera, setting.vehicle, setting.station.ids)
         server = partial(FoxgloveLive, host, foxglove_port, *shared)
         workers.append(Worker("foxglove", server, queue=_SHORT, patient=True))
     if rerun is not None:
         if not rerun.startswith("rerun+http"):
             raise InputError(f"--rerun {rerun}: wanted rerun+http://HOST:PORT/proxy")
-        workers.append(Worker("rerun", partial(open_rerun, rerun, scene), queue=_SHORT, patient=True))
+        workers.append(Worker("rerun", partial(open_rerun, rerun, setting), queue=_SHORT, patient=True))
     return workers
 
 
-def _file_sinks(scene: Scene, station_file: Path, out: Path | None, record: list[Path], force: bool) -> list[Worker]:
+def _file_sinks(
+    setting: Setting, station_file: Path, out: Path | None, record: list[Path], force: bool
+) -> list[Worker]:
     workers = []
     if out is not None:
         prepare_folder(out, force)
-        folder = RunSink(out, scene.station.ids)
+        folder = RunSink(out, setting.station.ids)
         copy(station_file, out / "station.yaml")
-        save_camera(scene.camera, out / "camera.yaml")
+        save_camera(setting.camera, out / "camera.yaml")
         workers.append(Worker(out.name, lambda: folder, queue=_ROWS, pictures=False))
     for path in record:
         if path.suffix not in FILE_KINDS:
             raise InputError(f"--record {path}: not one of {', '.join(FILE_KINDS)}")
         require_new(path, force)
-        workers.append(Worker(path.name, Numbered(path, scene).open, queue=_LONG, patient=True))
+        workers.append(Worker(path.name, Numbered(path, setting).open, queue=_LONG, patient=True))
     return workers
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 import signal
+import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.resources import files
@@ -32,6 +34,7 @@ app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
 SIM = "sim:"
 DEFAULT_STATION, DEFAULT_CAMERA = "cage-2x2x5", "imx264-60deg"
+PLAIN_EVERY_S = 10.0  # between two lines of progress where there is no terminal
 _SIMULATED = (
     "frames",
     "video.mp4",
@@ -96,7 +99,7 @@ def shipped_or_path(kind: str, name: str) -> Path:
     shipped = Path(str(files("lumidock"))) / f"{kind}s" / f"{name}.yaml"
     path = shipped if "/" not in name and shipped.exists() else Path(name)
     if path.exists() and not path.is_file():
-        raise InputError(f"{path}: not a file")  # a pipe could be read once only, and a run reads it thrice
+        raise InputError(f"{path}: not a file")  # a pipe can be read only once, and a run reads the file three times
     return path
 
 
@@ -128,7 +131,7 @@ def prepare_folder(folder: Path, force: bool) -> None:
 
 
 def prepare_sequence(folder: Path, force: bool) -> None:
-    """Make a folder for a simulated sequence, or clear one; frames that were not simulated are left alone."""
+    """Make a folder for a simulated sequence, or clear one; a folder of frames that were not simulated is refused."""
     truth = folder / "truth.csv"
     found = [name for name in (*_SIMULATED, "camera.yaml", "station.yaml") if (folder / name).exists()]
     if force and found and not truth.exists():
@@ -177,7 +180,10 @@ def simulated(source: str, folder: Path, station: str | None, camera: str | None
 
 @contextmanager
 def interrupts_held() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C, but not a second one, until the callback that this yields: compiled code cannot be left half-way."""
+    """Delay Ctrl-C until the callback that this yields is called, since compiled code cannot be interrupted safely.
+
+    A second Ctrl-C is not delayed.
+    """
     before = signal.getsignal(signal.SIGINT)
     held: list[int] = []
 
@@ -198,21 +204,68 @@ def interrupts_held() -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def progress_bar(title: str) -> Iterator[Callable[[int, int | None], None]]:
-    """A bar with ETA on standard error, for a person only; yields a callback (done, total)."""
+def told_at_interrupt(left: str) -> Iterator[None]:
+    """Say at Ctrl-C what is `left` where, in one line on standard error."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(f"lumidock: interrupted; {left}", file=sys.stderr)
+        raise
+
+
+Report = Callable[[int, int | None], None]
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Report]:
+    """Progress on standard error: a bar on a terminal, elsewhere a line every ten seconds.
+
+    Yields a callback (done, total).
+    """
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _PlainProgress(title).report
+        return
     columns = (
+        TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
+        TextColumn("elapsed"),
         TimeElapsedColumn(),
-        TextColumn("left"),
+        TextColumn("remaining"),
         TimeRemainingColumn(),
     )
-    console = Console(stderr=True)
-    with Progress(TextColumn("{task.description}"), *columns, console=console, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console) as bar:
         task = bar.add_task(title, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
+class _PlainProgress:
+    """Lines for a log or a pipe, the first after ten seconds: what is over sooner needs none."""
+
+    def __init__(self, title: str) -> None:
+        self._title, self._start_s = title, time.monotonic()
+        self._next_s = self._start_s + PLAIN_EVERY_S
+
+    def report(self, done: int, total: int | None) -> None:
+        """Print a line if the last one was long enough ago."""
+        now = time.monotonic()
+        if now < self._next_s:
+            return
+        self._next_s = now + PLAIN_EVERY_S
+        elapsed_s = now - self._start_s
+        line = f"{self._title}: {done}{f' of {total}' if total else ''}, elapsed {duration(elapsed_s)}"
+        if total and done:
+            line += f", remaining about {duration(elapsed_s * (total - done) / done)}"
+        print(line, file=sys.stderr, flush=True)
+
+
+def duration(seconds: float) -> str:
+    """Hours, minutes and seconds as h:mm:ss."""
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
 def example(*lines: str) -> str:
-    """The end of a command's help: commands to type."""
+    """The examples at the end of a command's help."""
     return "\n\n".join(["Examples:", *lines])

@@ -1,8 +1,8 @@
-"""A campaign: scenarios x seeds x methods through the light door, counted.
+"""A campaign: scenarios x seeds x methods on bare detections (`process_detections`), and what is counted in them.
 
-A shard is one scenario, one method and a block of seeds. Its counts land in a file of its own as soon as they are
-there, so that a campaign that was cut short goes on where it was. What a table says does not depend on how many workers
-there were: counts and histograms are of integers, and shards are added up in their order.
+A shard is one scenario, one method and a block of seeds. Its counts are written into a file of their own as soon as
+they are known, so that a campaign that was interrupted continues with the shards that are missing. The table does not
+depend on the number of workers: counts and histograms hold integers, and shards are added up in their order.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from lumidock.camera import Camera, load_camera
 from lumidock.config import Config
 from lumidock.errors import InputError, LumidockError
 from lumidock.evaluation.campaign_table import markdown, row_of
-from lumidock.evaluation.counts import Run, Tally, tally_run
+from lumidock.evaluation.counts import SimulatedRun, Tally, tally_run
 from lumidock.evaluation.cramer_rao import Bound
 from lumidock.methods import Method, localizer_of
 from lumidock.sim.detections import SimulatedFrame, simulated_frames
@@ -41,7 +41,7 @@ from lumidock.station import Station, load_station
 from lumidock.yamlfile import validate
 
 _SEEDS_PER_SHARD = 5
-_MAX_POOLS = 4  # a worker that dies takes its pool with it; the shards that are left get so many in all
+_MAX_POOLS = 4  # a worker that dies breaks its pool; after so many broken pools the campaign is given up
 Progress = Callable[[int, int | None], None]
 
 
@@ -50,7 +50,7 @@ Progress = Callable[[int, int | None], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shard:
-    """One scenario, one method and the seeds `first` to `stop` - 1; `key` stands for all that its counts depend on."""
+    """One scenario, one method and the seeds `first` to `stop` - 1; `key` hashes all that its counts depend on."""
 
     scenario: Scenario
     config: Config
@@ -71,7 +71,7 @@ class Shard:
 
 
 def run_shard(shard: Shard) -> dict[str, Any]:
-    """Counts of one shard, and the seconds that it took; made in a worker."""
+    """Counts of one shard, and the seconds that it took; runs in a worker process."""
     cv2.setNumThreads(1)
     start, tally = time.perf_counter(), Tally()
     localizer = localizer_of(shard.method, shard.station, shard.camera, shard.config, cold=shard.cold)
@@ -80,27 +80,28 @@ def run_shard(shard: Shard) -> dict[str, Any]:
     return {"key": shard.key, "tally": tally.as_dict(), "seconds": time.perf_counter() - start}
 
 
-def run_seed(shard: Shard, localizer: Method, seed: int) -> Run:
-    """One seed through the light door; a sequence begins without history."""
+def run_seed(shard: Shard, localizer: Method, seed: int) -> SimulatedRun:
+    """One seed through `process_detections`; each sequence of it begins without history."""
     frames = list(simulated_frames(shard.scenario, shard.station, shard.camera, seed))
     fixes = []
     for frame in frames:
         if frame.step == 0:
             localizer.forget()
         fixes.append(localizer.process_detections(frame.detections))
-    return Run(shard.scenario, seed, frames, fixes, _owed(shard, frames) if shard.bound else None)
+    eligible = _eligible(shard, frames) if shard.bound else None
+    return SimulatedRun(shard.scenario, seed, frames, fixes, shard.station.alert_limits, eligible)
 
 
-def _owed(shard: Shard, frames: Sequence[SimulatedFrame]) -> np.ndarray:
-    """In which frames (N,) the bound of what is possible owes a valid fix."""
+def _eligible(shard: Shard, frames: Sequence[SimulatedFrame]) -> np.ndarray:
+    """In which frames (N,) the Cramer-Rao bound is far enough inside the alert limits for a valid fix."""
     bound = Bound(shard.station, shard.camera, shard.config, cold=shard.cold)
-    owed = np.zeros(len(frames), bool)
+    eligible = np.zeros(len(frames), bool)
     for k, frame in enumerate(frames):
         if frame.step == 0:
             bound.forget()
         lights = frame.light[frame.light >= 0]
-        owed[k] = bound.owes(frame.detections.t_ns, frame.T_dock_cam, lights)
-    return owed
+        eligible[k] = bound.allows_valid(frame.detections.t_ns, frame.T_dock_cam, lights)
+    return eligible
 
 
 # A campaign
@@ -108,7 +109,7 @@ def _owed(shard: Shard, frames: Sequence[SimulatedFrame]) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Campaign:
-    """What was asked for: shards in the order of the table, and an `identity` that is equal for equal requests."""
+    """A request: its shards in the order of the table, and an `identity` that is equal for equal requests."""
 
     shards: Sequence[Shard]
     identity: dict[str, Any]
@@ -161,7 +162,7 @@ def _digest(content: bytes) -> str:
 
 @cache
 def source_digest() -> str:
-    """Of all source of the package and its measured tables: counts are not mixed between versions of it."""
+    """Hash of the package's source and measured tables, so that counts of different versions are never mixed."""
     digest = hashlib.sha256()
     package = Path(__file__).parents[1]
     for path in sorted((*package.rglob("*.py"), *package.rglob("*.json"))):
@@ -170,9 +171,9 @@ def source_digest() -> str:
 
 
 def prepare(campaign: Campaign, out: Path, *, force: bool = False) -> None:
-    """Make the folder of a campaign, or take up the same one again.
+    """Make the folder of a campaign, or continue in the folder of the same one.
 
-    With `force` a folder that holds something else is taken over; shards that this campaign has too are kept.
+    With `force` a folder that holds something else is used too; of its shards those that this campaign has are kept.
     Raises: InputError.
     """
     described = out / "campaign.json"
@@ -217,7 +218,7 @@ def run_campaign(
 
 
 def _results(shards: list[Shard], workers: int, cluster: str | None) -> Iterator[tuple[Shard, dict[str, Any]]]:
-    """Counts of shards as they come; when a worker dies, what is left goes to new ones."""
+    """Counts of shards as they are finished; when a worker dies, the shards that are left go to a new pool."""
     if cluster is None and not workers:
         yield from ((shard, run_shard(shard)) for shard in shards)
         return
@@ -233,13 +234,13 @@ def _results(shards: list[Shard], workers: int, cluster: str | None) -> Iterator
 
 
 def _pooled(pool: Executor, shards: list[Shard]) -> Iterator[tuple[Shard, dict[str, Any]]]:
-    """Counts of shards as they come, but of those that a dead worker had."""
+    """Counts of shards as they are finished, except those whose worker died."""
     futures: dict[Future[dict[str, Any]], Shard] = {}
     try:
         for shard in shards:
             futures[pool.submit(run_shard, shard)] = shard
     except BrokenProcessPool:
-        pass  # those that were given out say so too
+        pass  # the futures of the shards that were submitted raise the same error below
     for future in as_completed(futures):
         try:
             result = future.result()
@@ -251,13 +252,13 @@ def _pooled(pool: Executor, shards: list[Shard]) -> Iterator[tuple[Shard, dict[s
 
 
 def _worker_died(error: Exception) -> bool:
-    """Whether it was the worker; dask's own error is known by its name, since dask need not be there."""
+    """Whether the worker died; dask's own error is recognised by its name, since dask need not be installed."""
     return isinstance(error, (BrokenProcessPool, CancelledError)) or type(error).__name__ == "KilledWorker"
 
 
 @contextmanager
 def worker_pool(workers: int, cluster: str | None) -> Iterator[Executor]:
-    """Worker processes here, or those of a dask cluster."""
+    """Worker processes on this machine, or those of a dask cluster."""
     if cluster is not None:
         with _dask_client(cluster) as client:
             yield client.get_executor()
@@ -282,7 +283,7 @@ def _dask_client(address: str) -> Any:  # noqa: ANN401
 
 
 def _start_worker() -> None:
-    """Let Ctrl-C end a worker without a word, and the end of the parent too."""
+    """Let a worker end silently at Ctrl-C, and when its parent process ends."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -295,7 +296,7 @@ def _end_with_parent() -> None:
 
 
 def _read_shard(out: Path, shard: Shard) -> dict[str, Any] | None:
-    """The counts of a shard that was finished before."""
+    """The counts of a shard that an earlier call finished; None where there are none."""
     content = read_json(out / "shards" / shard.file)
     return content if content and content.get("key") == shard.key else None
 
@@ -310,7 +311,7 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a file so that it is there whole or not at all."""
+    """Write a file so that, when the program is killed, it is either complete or absent."""
     partial = path.with_name(f"{path.name}.tmp")
     partial.write_text(text, encoding="utf-8")
     os.replace(partial, path)

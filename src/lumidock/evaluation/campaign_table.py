@@ -47,9 +47,9 @@ def _mean(frames: float, total: float) -> dict[str, float | None]:
 
 
 def markdown(table: dict[str, Any]) -> str:
-    """The table for people: what was answered, what it is worth, how far off it is, how it lasts."""
+    """The table for people: availability and identities, integrity, errors, protection levels, and gaps."""
     parts = [
-        f"Seeds {table['seeds'][0]} to {table['seeds'][1] - 1}{', every frame cold' * table['cold']}; "
+        f"Seeds {table['seeds'][0]} to {table['seeds'][1] - 1}{', every frame without history' * table['cold']}; "
         f"lumidock {table['lumidock']}.",
         *(_section(title, columns, table["rows"]) for title, columns in _SECTIONS.items()),
     ]
@@ -96,7 +96,7 @@ def _error(name: str) -> Callable[[dict[str, Any]], str]:
 
 
 def _by_frame(word: str) -> Callable[[dict[str, Any]], str]:
-    """Share of the sequences with an answer by each of their frames, %."""
+    """Share of the sequences with a fix by each of their frames, %."""
 
     def cell(row: dict[str, Any]) -> str:
         counts = row["counts"]
@@ -127,7 +127,7 @@ _ERRORS = {
     "range, m": "range_m",
 }
 _SECTIONS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
-    "Answers and names": {
+    "Availability and identities": {
         "runs": _count("runs"),
         "frames": _count("frames"),
         "0-3 lights": _count("frames_few"),
@@ -136,15 +136,15 @@ _SECTIONS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
         "accepted, %": _percent("accepted", "frames"),
         "with 6+, %": _percent("accepted_full", "frames_full"),
         "with 4-5, %": _percent("accepted_some", "frames_some"),
-        "names": _count("named"),
-        "wrong, coincident": _count("wrong_coincident"),
-        "wrong, else": _count("wrong_else"),
-        "frames with wrong": _count("frames_with_wrong"),
+        "identified": _count("identified"),
+        "wrong identities: harmful coincidences": _count("wrong_coincident"),
+        "others": _count("wrong_else"),
+        "frames with a wrong identity": _count("frames_with_wrong"),
     },
-    "Trust": {
+    "Integrity": {
         "valid, %": _percent("valid", "frames"),
         "valid with 6+, %": _percent("valid_full", "frames_full"),
-        "valid where owed, %": _percent("valid_eligible", "frames_eligible"),
+        "valid where the bound allows it, %": _percent("valid_eligible", "frames_eligible"),
         "guide, %": _percent("guide", "frames"),
         "guide with 6+, %": _percent("guide_full", "frames_full"),
         "guide with 4-5, %": _percent("guide_some", "frames_some"),
@@ -159,11 +159,11 @@ _SECTIONS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
         "accepted by frame, %": _by_frame("accepted"),
         "guide by frame, %": _by_frame("guide"),
         "longest gap valid, s": _number("longest_gap_s", "valid", digits=2),
-        "guide, s": _number("longest_gap_s", "guide", digits=2),
+        "longest gap guide, s": _number("longest_gap_s", "guide", digits=2),
         "valid without light for 0.3 s": _of("stale_valid", "frames_stale"),
-        "guide so": _of("stale_guide", "frames_stale"),
-        "never back": _of("never_back_valid", "blinded_valid"),
-        "frames until back, median": _number("frames_back", "valid", "median", digits=0),
+        "guide without light for 0.3 s": _of("stale_guide", "frames_stale"),
+        "never valid again after a black-out": _of("never_back_valid", "blinded_valid"),
+        "frames until valid again, median": _number("frames_back", "valid", "median", digits=0),
         "largest": _number("frames_back", "valid", "max", digits=0),
     },
 }

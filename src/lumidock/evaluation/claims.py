@@ -1,6 +1,6 @@
-"""May a run's own claims be believed: errors over alert limits and protection levels, covariances, gaps.
+"""Whether the uncertainty that a run states holds against the truth: alert limits, protection levels, NEES, gaps.
 
-Pure functions on arrays, N poses and M guides against the truth; `metrics` reads the files.
+Pure functions on arrays, N poses and M guides with their true values; `metrics` reads the files.
 """
 
 from __future__ import annotations
@@ -12,24 +12,22 @@ from typing import Any
 
 import numpy as np
 
+from lumidock.alert_limits import AlertLimits
 from lumidock.datatypes import Array, require_shape
 from lumidock.geometry import bearing_and_range, so3_log
-from lumidock.integrity import alert_limits
 
 POSE_ERRORS, GUIDE_ERRORS = ("lateral", "axial", "angle"), ("bearing", "range")
 LONG_GAP_NS = 450_000_000  # three frames of the approach
-_BEARING_LIMIT_RAD, _RANGE_LIMIT_M, _RANGE_LIMIT_SHARE = np.deg2rad(1.5), 0.3, 0.1
 _MIN_EIGENVALUE = 1e-12  # of a correlation matrix; less is rounding of the file
-_GUIDE_FROM_M = 3.0  # nearer than this a guide has no limits of its own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseClaims:
-    """N valid fixes: what they say of themselves, and how far off they are.
+    """N valid fixes: their errors against the truth, and the uncertainty that they state.
 
     `z_m` (N,) estimated; `errors` (N, 6) [t_est - t_true m, w rad], R_est = Exp(w) R_true, in dock axes; `levels`
     (N, 3) protection levels lateral m, axial m, total rotation rad; `covariance` (N, 6, 6) of the errors; both NaN
-    where the method gives none; `stage` (N,).
+    where the method gives none; `stage` (N,); `alert_limits` of the dock.
     """
 
     z_m: Array
@@ -37,6 +35,7 @@ class PoseClaims:
     levels: Array
     covariance: Array
     stage: Sequence[str]
+    alert_limits: AlertLimits
 
     def __post_init__(self) -> None:
         n = len(self.z_m)
@@ -46,25 +45,24 @@ class PoseClaims:
 
     def sizes(self) -> Array:
         """Lateral m, axial m and total rotation rad of each error: (N, 3)."""
-        e = self.errors
-        return np.stack([np.hypot(e[:, 0], e[:, 1]), np.abs(e[:, 2]), np.linalg.norm(e[:, 3:], axis=1)], axis=1)
+        return error_sizes(self.errors)
 
     def limits(self) -> Array:
         """Alert limits (N, 3) in the order of `sizes`; without a protection level those at the estimated z."""
-        metres, angle = alert_limits(self.z_m, np.nan_to_num(self.levels[:, 1]))
-        return np.stack([metres, metres, angle], axis=1)
+        return self.alert_limits.of_poses(self.z_m, np.nan_to_num(self.levels[:, 1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GuideClaims:
     """M frames with a guide: `claimed` (M, 3) bearings rad and range m, `true` (M, 3) ones, `levels` (M, 2).
 
-    `levels` are protection levels bearing rad and range m, NaN where the method gives none.
+    `levels` are protection levels bearing rad and range m, NaN where the method gives none; `alert_limits` the dock's.
     """
 
     claimed: Array
     true: Array
     levels: Array
+    alert_limits: AlertLimits
 
     def __post_init__(self) -> None:
         m = len(self.claimed)
@@ -79,16 +77,17 @@ class GuideClaims:
         return np.stack([np.hypot(*turned.T), np.abs(off[:, 2])], axis=1)
 
     def limits(self) -> Array:
-        """Alert limits (M, 2) in the order of `sizes`; infinite near the origin, and with it behind the camera."""
-        range_m, ahead = self.claimed[:, 2], (np.abs(self.claimed[:, :2]) < np.pi / 2).all(axis=1)
-        limits = np.stack(
-            [np.full_like(range_m, _BEARING_LIMIT_RAD), np.maximum(_RANGE_LIMIT_M, _RANGE_LIMIT_SHARE * range_m)],
-            axis=1,
-        )
-        return np.where((ahead & (range_m > _GUIDE_FROM_M))[:, None], limits, np.inf)
+        """Alert limits (M, 2) at the claimed range, in the order of `sizes`; infinite where a guide has none."""
+        return self.alert_limits.of_guides(self.claimed)
 
 
 Claims = PoseClaims | GuideClaims
+
+
+def error_sizes(errors: Array) -> Array:
+    """Lateral m, axial m and total rotation rad (N, 3) of errors (N, 6) [t_est - t_true m, w rad]."""
+    lateral, rotation = np.hypot(errors[:, 0], errors[:, 1]), np.linalg.norm(errors[:, 3:], axis=1)
+    return np.stack([lateral, np.abs(errors[:, 2]), rotation], axis=1)
 
 
 def pose_error(T_dock_cam: Array, T_dock_cam_true: Array) -> Array:
@@ -98,12 +97,12 @@ def pose_error(T_dock_cam: Array, T_dock_cam_true: Array) -> Array:
 
 
 def true_guide(T_dock_cam_true: Array) -> Array:
-    """What a guide should have said (3,): both bearings rad and the range m of the dock's origin."""
+    """The true guide (3,): both bearings rad and the range m of the dock's origin."""
     return np.array(bearing_and_range(T_dock_cam_true))
 
 
 def hazardous(claims: Claims) -> dict[str, int]:
-    """Frames whose error is over the alert limit although they claim to be usable: `any`, and by kind of error."""
+    """Frames that say they may be used although an error is over its alert limit: `any`, and by kind of error."""
     over = claims.sizes() > claims.limits()
     return {"any": int(over.any(axis=1).sum())} | _counts(_names(claims), over)
 
@@ -159,7 +158,7 @@ def nees(errors: Array, covariance: Array) -> Array:
 
 
 def consistency(poses: PoseClaims) -> dict[str, Any]:
-    """Mean NEES, over all poses with a covariance and by stage; `improper` covariances are counted apart."""
+    """Mean NEES of all poses with a covariance, and by stage; those not positive definite are counted as `improper`."""
     squares, stage = nees(poses.errors, poses.covariance), np.array(poses.stage, str)
     given = np.isfinite(poses.covariance).all(axis=(1, 2))
     by_stage = {str(name): _mean(squares[stage == name]) for name in dict.fromkeys(poses.stage)}

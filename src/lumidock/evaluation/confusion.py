@@ -1,7 +1,8 @@
-"""How well a layer's lights can be told apart: the wrong naming that fits the view best, and by how much it misses."""
+"""How easily the lights of a layer are confused: the wrong assignment that fits a view best, and how badly it fits."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import combinations, permutations
 
 import numpy as np
@@ -10,36 +11,46 @@ from numpy.typing import NDArray
 from lumidock.datatypes import Array
 
 _Complex = NDArray[np.complex128]
-_SCALE = (
-    0.5,
-    2.0,
-)  # a layer seen at half or double its true size is a wrong range that the approach excludes
+_SCALE = (0.5, 2.0)  # a layer seen at half or double its size means a range that is wrong by as much, which is noticed
+
+
+@dataclass(frozen=True, slots=True)
+class Confusion:
+    """A wrong assignment: the lights `seen` are taken for the lights `taken_for`, with this RMS residual in metres."""
+
+    residual_m: float
+    seen: tuple[int, ...] = ()
+    taken_for: tuple[int, ...] = ()
 
 
 def worst_confusion(
     p_dock: Array, *, seen: int, max_roll_rad: float = np.deg2rad(15.0), mirrored: bool = False
-) -> float:
-    """RMS residual in metres of the best-fitting wrong naming of any `seen` lights of `p_dock` (N, 3).
+) -> Confusion:
+    """The best-fitting wrong assignment of any `seen` lights of `p_dock` (N, 3); lights are indices into it.
 
-    The view is the frontal one (depth dropped) and a naming may be helped by any shift, scale of 0.5-2 and roll up to
-    `max_roll_rad`. With `mirrored` the lights are seen in the water surface or in a wall, where every naming is wrong.
+    The view is the frontal one (depth dropped); an assignment may be fitted by any shift, a scale of 0.5-2 and a roll
+    of up to `max_roll_rad`. With `mirrored` the lights are seen as a mirror image in the water surface or a wall, where
+    every assignment is wrong.
 
     Source: the closed-form similarity of S. Umeyama, 1991, in complex numbers.
     """
     z = p_dock[:, 0] + 1j * p_dock[:, 1]
-    names = np.array(list(permutations(range(len(z)), seen)))
-    worst = np.inf
+    assignments = np.array(list(permutations(range(len(z)), seen)))
+    worst = Confusion(np.inf)
     for subset in combinations(range(len(z)), seen):
-        wrong = names if mirrored else names[(names != np.array(subset)).any(axis=1)]
+        wrong = assignments if mirrored else assignments[(assignments != np.array(subset)).any(axis=1)]
         observed = z[list(subset)]
-        views = (observed.conj(), -observed.conj()) if mirrored else (observed,)
-        worst = min(worst, *(float(_residuals(z[wrong], view, max_roll_rad).min()) for view in views))
+        for view in (observed.conj(), -observed.conj()) if mirrored else (observed,):
+            residuals = _residuals(z[wrong], view, max_roll_rad)
+            best = int(residuals.argmin())
+            if residuals[best] < worst.residual_m:
+                worst = Confusion(float(residuals[best]), subset, tuple(wrong[best].tolist()))
     return worst
 
 
-def _residuals(named: _Complex, observed: _Complex, max_roll: float) -> Array:
-    """RMS of |a w + b - z| for each row w of `named` (M, K) against `observed` z (K,), at the best allowed a, b."""
-    w = named - named.mean(axis=1, keepdims=True)
+def _residuals(assigned: _Complex, observed: _Complex, max_roll: float) -> Array:
+    """RMS of |a w + b - z| for each row w of `assigned` (M, K) against `observed` z (K,), at the best allowed a, b."""
+    w = assigned - assigned.mean(axis=1, keepdims=True)
     z = observed - observed.mean()
     power = (np.abs(w) ** 2).sum(axis=1)
     cross = (w.conj() * z).sum(axis=1)

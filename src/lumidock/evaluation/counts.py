@@ -1,6 +1,6 @@
-"""What is counted in one run of a campaign, and how counts are added up.
+"""What is counted in one simulated run of a campaign, and how the counts of many runs are added up.
 
-Counts and histograms are of integers, so that what they add up to does not depend on who counted what.
+Counts and histograms hold integers, so that their sum does not depend on how the runs were spread over workers.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from lumidock.alert_limits import DEFAULT_ALERT_LIMITS, AlertLimits
 from lumidock.datatypes import Array, Fix, Indices
 from lumidock.evaluation.claims import GUIDE_ERRORS, POSE_ERRORS, GuideClaims, PoseClaims, nees
 from lumidock.sim.detections import SimulatedFrame
@@ -19,9 +20,9 @@ from lumidock.sim.scenario import Scenario
 
 _BINS_PER_DECADE, _LEAST = 100, 1e-6  # of the histograms: m, rad, frames or 1
 _BINS = 10 * _BINS_PER_DECADE
-_FULL, _SOME = 6, 4  # detected lights: from six on guidance is owed, from four on a fix can be had
-_NEAR_TRUTH = 3.0  # sigmas of the noise within which a wrong spot stands where its light would
-_STALE_NS = 300_000_000  # without any light an answer is good for so long
+_FULL, _SOME = 6, 4  # detected lights: with six a guide is expected, with four a fix is possible
+_NEAR_TRUTH = 3.0  # sigmas of the noise within which a wrong detection stands where the missing light would be
+_STALE_NS = 300_000_000  # a fix may be predicted so long after the last detected light, `max_age_s` of the settings
 
 
 @dataclass(slots=True)
@@ -92,16 +93,17 @@ class Tally:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
-    """One seed of a scenario: N frames and their fixes.
+class SimulatedRun:
+    """One seed of a scenario: N frames, their fixes and the dock's alert limits.
 
-    `eligible` (N,) says in which frames a valid fix is owed; None where nobody has worked it out.
+    `eligible` (N,) says in which frames the Cramer-Rao bound allows a valid fix; None where it was not computed.
     """
 
     scenario: Scenario
     seed: int
     frames: Sequence[SimulatedFrame]
     fixes: Sequence[Fix]
+    alert_limits: AlertLimits = DEFAULT_ALERT_LIMITS
     eligible: np.ndarray | None = None
 
     def flags(self, name: str) -> np.ndarray:
@@ -114,14 +116,14 @@ class Run:
         return np.fromiter(map(tests[name], self.fixes), bool, len(self.fixes))
 
 
-def tally_run(run: Run) -> Tally:
+def tally_run(run: SimulatedRun) -> Tally:
     """Everything that is counted in one run."""
     tally = Tally()
     tally.add(runs=1, frames=len(run.frames))
-    frame, true, named = _labels(run)
+    frame, true, assigned = _assignments(run)
     lights = np.bincount(frame[true >= 0], minlength=len(run.frames))
-    _count_labels(tally, run, frame, true, named)
-    _count_answers(tally, run, lights)
+    _count_identities(tally, run, frame, true, assigned)
+    _count_fixes(tally, run, lights)
     _judge_poses(tally, run)
     _judge_guides(tally, run)
     _count_gaps(tally, run)
@@ -130,34 +132,38 @@ def tally_run(run: Run) -> Tally:
     return tally
 
 
-def _labels(run: Run) -> tuple[Indices, Indices, Indices]:
-    """All spots of a run in a row: frame, true light and the light it was named after, (S,) each; -1 for none."""
+def _assignments(run: SimulatedRun) -> tuple[Indices, Indices, Indices]:
+    """All S detections of a run: frame, true light, and the light it was assigned to, (S,) each; -1 for none."""
     counts = [len(frame.light) for frame in run.frames]
     nothing = np.full(max(counts, default=0), -1, np.int64)
-    named = [
+    assigned = [
         nothing[:count] if fix.match is None else fix.match.light for fix, count in zip(run.fixes, counts, strict=True)
     ]
     frame = np.repeat(np.arange(len(counts)), counts)
-    return frame, np.concatenate([frame.light for frame in run.frames]), np.concatenate(named)
+    return frame, np.concatenate([frame.light for frame in run.frames]), np.concatenate(assigned)
 
 
-def _count_labels(tally: Tally, run: Run, frame: Indices, true: Indices, named: Indices) -> None:
-    """Names given, and wrong ones; a wrong one is a harmful coincidence where its light would have been seen."""
-    wrong = (named >= 0) & (named != true)
+def _count_identities(tally: Tally, run: SimulatedRun, frame: Indices, true: Indices, assigned: Indices) -> None:
+    """Identified detections, and wrong ones: `true` is exact here, so another lamp or no lamp made the detection.
+
+    A wrong one is a harmful coincidence where the light that it was assigned to would have been seen.
+    """
+    wrong = (assigned >= 0) & (assigned != true)
     uv = np.concatenate([one.detections.uv for one in run.frames])[wrong]
-    truth = np.array([one.uv for one in run.frames])[frame[wrong], named[wrong]]
+    truth = np.array([one.uv for one in run.frames])[frame[wrong], assigned[wrong]]
     near = np.linalg.norm(uv - truth, axis=1) <= _NEAR_TRUTH * run.scenario.detections.noise_px
     tally.add(
-        named=(named >= 0).sum(),
+        identified=(assigned >= 0).sum(),
+        wrong_other_light=(true[wrong] >= 0).sum(),
         wrong_coincident=near.sum(),
         wrong_else=(~near).sum(),
         frames_with_wrong=len(np.unique(frame[wrong])),
     )
 
 
-def _count_answers(tally: Tally, run: Run, lights: Indices) -> None:
-    """Frames, and those with an answer, by the number `lights` (N,) of detected lights; and why there was none."""
-    answers = {word: run.flags(word) for word in ("accepted", "valid", "guide")}
+def _count_fixes(tally: Tally, run: SimulatedRun, lights: Indices) -> None:
+    """Frames, and those with a fix, by the number `lights` (N,) of detected lights; and the reasons for no fix."""
+    usable = {word: run.flags(word) for word in ("accepted", "valid", "guide")}
     groups = {
         "": np.ones(len(lights), bool),
         "_few": lights < _SOME,
@@ -169,20 +175,20 @@ def _count_answers(tally: Tally, run: Run, lights: Indices) -> None:
     for suffix, group in groups.items():
         if suffix:
             tally.add(**{f"frames{suffix}": group.sum()})
-        tally.add(**{f"{word}{suffix}": (flags & group).sum() for word, flags in answers.items()})
+        tally.add(**{f"{word}{suffix}": (flags & group).sum() for word, flags in usable.items()})
     reasons = Counter(fix.reason for fix in run.fixes if fix.reason)
     tally.counts.update({f"reason {word}": count for word, count in reasons.items()})
 
 
-def _judge_poses(tally: Tally, run: Run) -> None:
-    """Errors of the valid poses, their protection levels, and which of them mislead."""
+def _judge_poses(tally: Tally, run: SimulatedRun) -> None:
+    """Errors of the valid poses, their protection levels, and how many errors are over the alert limits."""
     chosen = [pair for pair in zip(run.frames, run.fixes, strict=True) if pair[1].valid]
     if not run.scenario.shows_dock:
-        tally.add(hazardous_valid=len(chosen))  # no pose can be right of what is not in view
+        tally.add(hazardous_valid=len(chosen))  # no pose can be right where the dock is not in view
         return
     if not chosen:
         return
-    claims = pose_claims(chosen)
+    claims = pose_claims(chosen, run.alert_limits)
     errors, levels = claims.sizes(), claims.levels
     over = errors > claims.limits()
     tally.add(hazardous_valid=over.any(axis=1).sum())
@@ -199,8 +205,8 @@ def _spread_error(tally: Tally, name: str, error: Array, level: Array) -> None:
     tally.add(**{f"levels_{name}": np.isfinite(level).sum(), f"over_level_{name}": (error > level).sum()})
 
 
-def pose_claims(pairs: Sequence[tuple[SimulatedFrame, Fix]]) -> PoseClaims:
-    """What valid fixes say of themselves, and how far off they are."""
+def pose_claims(pairs: Sequence[tuple[SimulatedFrame, Fix]], limits: AlertLimits) -> PoseClaims:
+    """Errors of valid fixes against the truth, and the uncertainty that they state."""
     T = np.array([fix.T_dock_cam for _, fix in pairs])
     T_true = np.array([frame.T_dock_cam for frame, _ in pairs])
     unknown = np.full((6, 6), np.nan)
@@ -214,6 +220,7 @@ def pose_claims(pairs: Sequence[tuple[SimulatedFrame, Fix]]) -> PoseClaims:
         np.array(levels),
         np.array([unknown if fix.covariance is None else fix.covariance for _, fix in pairs]),
         [fix.stage for _, fix in pairs],
+        limits,
     )
 
 
@@ -227,10 +234,10 @@ def rotation_vectors(R: Array) -> Array:
     return np.asarray(w)
 
 
-def _count_nees(tally: Tally, run: Run, sequence: list[int], claims: PoseClaims) -> None:
-    """NEES of one frame of each sequence and stage: others of the same are not independent of it.
+def _count_nees(tally: Tally, run: SimulatedRun, sequence: list[int], claims: PoseClaims) -> None:
+    """NEES of one frame of each sequence and stage: the errors of neighbouring frames are correlated.
 
-    Which one the seed decides, since the first is no fair sample.
+    The seed decides which frame, since always taking the first would be a biased sample.
     """
     given = np.asarray(np.isfinite(claims.covariance).all(axis=(1, 2)))
     keys = np.random.default_rng([run.seed, 100]).random(len(given))
@@ -249,26 +256,25 @@ def _count_nees(tally: Tally, run: Run, sequence: list[int], claims: PoseClaims)
             tally.add(improper_covariances=1)
 
 
-def _judge_guides(tally: Tally, run: Run) -> None:
-    """Errors of the guides, their protection levels, and which of them mislead."""
+def _judge_guides(tally: Tally, run: SimulatedRun) -> None:
+    """Errors of the guides, their protection levels, and how many errors are over the alert limits."""
     chosen = [pair for pair in zip(run.frames, run.fixes, strict=True) if pair[1].guide is not None]
     if not run.scenario.shows_dock:
         tally.add(hazardous_guide=len(chosen))
         return
     if not chosen:
         return
-    claims = guide_claims(chosen)
+    claims = guide_claims(chosen, run.alert_limits)
     errors = claims.sizes()
-    limits = GuideClaims(claims.true, claims.claimed, claims.levels).limits()  # those at the true range
-    over = errors > limits
+    over = errors > run.alert_limits.of_guides(claims.true)
     tally.add(hazardous_guide=over.any(axis=1).sum())
     tally.add(**{f"hazardous_{name}": which.sum() for name, which in zip(GUIDE_ERRORS, over.T, strict=True)})
     for name, error, level in zip(GUIDE_ERRORS, errors.T, claims.levels.T, strict=True):
         _spread_error(tally, name, error, level)
 
 
-def guide_claims(pairs: Sequence[tuple[SimulatedFrame, Fix]]) -> GuideClaims:
-    """What guides say, and what is true."""
+def guide_claims(pairs: Sequence[tuple[SimulatedFrame, Fix]], limits: AlertLimits) -> GuideClaims:
+    """The guides of fixes, and the true ones."""
     guides = [fix.guide for _, fix in pairs if fix.guide is not None]
     T = np.array([frame.T_dock_cam for frame, _ in pairs])
     x, y, z = -np.einsum("nji,nj->in", T[:, :3, :3], T[:, :3, 3])
@@ -276,10 +282,11 @@ def guide_claims(pairs: Sequence[tuple[SimulatedFrame, Fix]]) -> GuideClaims:
         np.array([(g.bearing_x_rad, g.bearing_y_rad, g.range_m) for g in guides]),
         np.stack([np.arctan2(x, z), np.arctan2(y, z), np.sqrt(x * x + y * y + z * z)], axis=1),
         np.array([(g.pl_bearing_rad, g.pl_range_m) for g in guides]),
+        limits,
     )
 
 
-def _count_gaps(tally: Tally, run: Run) -> None:
+def _count_gaps(tally: Tally, run: SimulatedRun) -> None:
     """The longest time between two usable frames in a row of the same sequence."""
     t_ns = np.array([frame.detections.t_ns for frame in run.frames])
     sequence = np.array([frame.sequence for frame in run.frames])
@@ -292,8 +299,8 @@ def _count_gaps(tally: Tally, run: Run) -> None:
             tally.note(f"gap_s_{word}", gaps * 1e-9)
 
 
-def _count_sequences(tally: Tally, run: Run) -> None:
-    """How many sequences of a path of draws had an answer by their k-th frame."""
+def _count_sequences(tally: Tally, run: SimulatedRun) -> None:
+    """In how many sequences of a path of draws there was a fix by their k-th frame."""
     hold = run.scenario.path.hold
     if run.scenario.path.kind != "draws" or hold == 1:
         return
@@ -303,8 +310,8 @@ def _count_sequences(tally: Tally, run: Run) -> None:
         tally.add(**{f"{word}_by_{k + 1}": by_now[:, k].sum() for k in range(hold)})
 
 
-def _count_blind(tally: Tally, run: Run, lights: Indices) -> None:
-    """Answers that outlive the last light by 0.3 s, and how many frames the first light needs to bring one back."""
+def _count_blind(tally: Tally, run: SimulatedRun, lights: Indices) -> None:
+    """Fixes given more than 0.3 s after the last detected light, and how many frames of light bring a fix back."""
     t_ns = np.array([frame.detections.t_ns for frame in run.frames])
     begins = np.array([frame.step == 0 for frame in run.frames])
     last = np.maximum.accumulate(np.where(lights > 0, np.arange(len(lights)), -1))
@@ -318,7 +325,7 @@ def _count_blind(tally: Tally, run: Run, lights: Indices) -> None:
 
 
 def _count_returns(tally: Tally, blind: np.ndarray, valid: np.ndarray, guide: np.ndarray) -> None:
-    """Frames (1 is the first with a light) from the end of each time without light to the next answer."""
+    """Frames (1 is the first with a light) from the end of each time without light to the next fix."""
     change = np.diff(blind.astype(np.int8))
     first, again = np.flatnonzero(change == 1) + 1, np.flatnonzero(change == -1) + 1
     again = again[again > first[0]] if len(first) else again[:0]

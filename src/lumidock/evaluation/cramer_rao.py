@@ -1,7 +1,7 @@
-"""What the lights in view allow at best: the filter's covariance along the true path, with the true names.
+"""The best accuracy that the lights in view allow: the filter's covariance along the true path, with true identities.
 
 A recursive Cramer-Rao bound (P. Tichavsky, C. Muravchik, A. Nehorai, 1998) under the filter's own noise, priors and
-history: where it is inside the alert limits with room to spare, a valid fix is owed.
+history. Where it is inside the alert limits with a margin, a good method gives a valid fix.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Indices
 from lumidock.geometry import se3_inverse
-from lumidock.integrity import alert_limit, sigma_factors
+from lumidock.integrity import sigma_factors
 from lumidock.pose import project_lights
 from lumidock.station import Station
 
 _MIN_START = 4
-_ROOM = 1.3  # a protection level this many times the bound's is still owed
+_MARGIN = 1.3  # protection levels this many times those of the bound must be inside the alert limits
 
 
 class Bound:
-    """Follows one run along its true path; `step` by `step` the protection levels (3,) that are possible."""
+    """Follows one run along its true path; each `step` gives the smallest protection levels (3,) that are possible."""
 
     def __init__(self, station: Station, camera: Camera, config: Config, *, cold: bool = False) -> None:
         self.station, self.camera, self.config, self.cold = station, camera, config, cold
@@ -70,14 +70,14 @@ class Bound:
             levels(R, t, self._P, nothing, track.NO_PLANE, self._factors, self._factors, False, np.empty((9, 9)))[:3]
         )
 
-    def owes(self, t_ns: int, T_dock_cam: Array, lights: Indices) -> bool:
-        """Whether a valid fix is owed in this frame: 1.3 times the bound is inside the alert limits."""
+    def allows_valid(self, t_ns: int, T_dock_cam: Array, lights: Indices) -> bool:
+        """Whether a valid fix is possible in this frame with a margin: 1.3 times the bound is inside the limits."""
         pl = self.step(t_ns, T_dock_cam, lights)
         if pl is None:
             return False
-        lateral, axial, angle = (_ROOM * pl).tolist()
-        limit_m, limit_rad = alert_limit(float(T_dock_cam[2, 3]), axial)
-        return max(lateral, axial) < limit_m and angle < limit_rad and math.isfinite(lateral)
+        lateral, axial, angle = (_MARGIN * pl).tolist()
+        lateral_m, axial_m, angle_rad = self.station.alert_limits.of_pose(float(T_dock_cam[2, 3]), axial)
+        return lateral < lateral_m and axial < axial_m and angle < angle_rad and math.isfinite(lateral)
 
     def _start(self, R: Array, t: Array) -> Array:
         x, P = track.start_states(self.station, None, self.config.track)

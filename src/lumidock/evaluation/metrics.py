@@ -1,28 +1,30 @@
-"""A run against the truth: errors, availability, gaps, names, how the two layers agree, what its claims are worth."""
+"""A run against the truth: errors, availability, gaps, identities of lights, and whether its stated errors hold."""
 
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections import Counter
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lumidock.alert_limits import DEFAULT_ALERT_LIMITS, AlertLimits
 from lumidock.camera import load_camera
 from lumidock.datatypes import Array
 from lumidock.errors import InputError
 from lumidock.evaluation import claims
 from lumidock.evaluation.claims import GuideClaims, PoseClaims
+from lumidock.evaluation.run_description import description_if_any, mean_nis, source_kind
 from lumidock.geometry import pose_from_quat, se3_inverse, transform_points
 from lumidock.station import Station, load_station
 from lumidock.streams.run_folder import COVARIANCE_COLUMNS, GUIDE_COLUMNS, PROTECTION_COLUMNS
 
 _POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-_SAME_DETECTION_PX = 3.0  # a named detection this close to its light's true centre was made by it
+_SAME_DETECTION_PX = 3.0  # a detection this close to a light's true centre was made by it
 _STAMPED = ("sequence", "detections", "bag")  # sources whose times are not made up or measured anew
 _STAMP = re.compile(r"-?[0-9]{1,18}")
 _RANGE_BINS_M = (-3.0, 0.0, 3.0, 8.0, 12.0, 18.0, 24.0, 30.0)
@@ -42,12 +44,14 @@ def true_poses(truth: Path) -> dict[str, Array]:
 def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
     """Compare a run folder with a simulated sequence folder, or with a truth.csv alone.
 
-    Errors are in dock axes: lateral hypot(x, y), axial |z|, angle the total rotation. Raises: InputError, one line.
+    Errors are in dock axes: lateral hypot(x, y), axial |z|, angle the total rotation. Alert limits are those of the run
+    folder's station file. Raises: InputError, one line.
     """
     folder = truth if truth.is_dir() else truth.parent
     true, path = true_poses(truth), run_folder / "fixes.csv"
-    fixes, described = read_rows(path, ("frame", "t_ns", "valid", "reason", *_POSE)), _described(run_folder)
-    _require_same_frames(truth, fixes, true, stamped=_source_kind(described) in _STAMPED)
+    fixes = read_rows(path, ("frame", "t_ns", "valid", "reason", *_POSE))
+    description = description_if_any(run_folder)
+    _require_same_frames(truth, fixes, true, stamped=source_kind(description) in _STAMPED)
     poses = {row["frame"]: _pose(path, row) for row in fixes if row["valid"] == "1"}
     gaps = {word: claims.continuity(_stamps(path, fixes, word)) for word in ("valid", "guide")}
     result: dict[str, Any] = {
@@ -60,45 +64,22 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
         "continuity": gaps,
     }
     result["availability"] = _shares(result)
-    result["nis"] = _nis(described)
-    result |= _judge(path, [row for row in fixes if row["frame"] in true], true)
+    result["nis"] = mean_nis(description)
+    known = [row for row in fixes if row["frame"] in true]
+    result |= _errors_and_claims(path, known, true, _alert_limits(run_folder))
     if (run_folder / "layers.csv").exists():
         result["layers"] = _layers(run_folder, true)
     if (folder / "lights_truth.csv").exists():
-        result["labels"] = _labels(run_folder, folder, true)
+        result["identities"] = _identities(run_folder, folder, true)
     if all((run_folder / name).exists() for name in ("lights.csv", "station.yaml", "camera.yaml")):
         result["residual_rms_px"] = _residual_rms_px(run_folder, poses)
     return result
 
 
-def _described(run_folder: Path) -> Any:  # noqa: ANN401  # whatever a JSON file holds
-    """The run.json of a run; None where another program made it."""
-    try:
-        return json.loads((run_folder / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-
-
-def _source_kind(described: Any) -> str:  # noqa: ANN401
-    try:
-        return str(described["source"]["kind"])
-    except (KeyError, TypeError):
-        return ""
-
-
-def _nis(described: Any) -> dict[str, float] | None:  # noqa: ANN401
-    """Mean innovation squared per degree of freedom, over the tracked frames, as the run has summed it up."""
-    try:
-        nis = described["counts"]["nis"]
-        return None if nis is None else {"frames": int(nis["frames"]), "mean": float(nis["mean"])}
-    except (KeyError, TypeError, ValueError):
-        return None
-
-
 def _require_same_frames(truth: Path, fixes: list[Row], true: dict[str, Array], *, stamped: bool) -> None:
-    """Raises: InputError for the truth of other frames, told by their names or, in a `stamped` run, by their times.
+    """Raises: InputError for a truth of other frames, recognised by their names or, in a `stamped` run, their times.
 
-    Every simulated sequence has a frame 000000. Some stamps may be broken, or off by a constant.
+    Names alone do not decide: every simulated sequence has a frame 000000. Stamps may be broken, or off by a constant.
     """
     known = [row for row in fixes if row["frame"] in true]
     if fixes and not known:
@@ -113,10 +94,16 @@ def _require_same_frames(truth: Path, fixes: list[Row], true: dict[str, Array], 
         raise InputError(f"{truth}: its frames were not taken at the times of the run's: another sequence")
 
 
-def _judge(path: Path, fixes: list[Row], true: dict[str, Array]) -> dict[str, Any]:
-    """Errors of the fixes that the truth knows, and what their own claims are worth."""
+def _alert_limits(run_folder: Path) -> AlertLimits:
+    """Those of the dock that the run was made for; the defaults where another program left no station file."""
+    station_file = run_folder / "station.yaml"
+    return load_station(station_file).alert_limits if station_file.exists() else DEFAULT_ALERT_LIMITS
+
+
+def _errors_and_claims(path: Path, fixes: list[Row], true: dict[str, Array], limits: AlertLimits) -> dict[str, Any]:
+    """Errors of the fixes whose true pose is known, and whether the uncertainty that they state holds."""
     valid, guided = ([row for row in fixes if row.get(word) == "1"] for word in ("valid", "guide"))
-    poses, guides = _pose_claims(path, valid, true), _guide_claims(path, guided, true)
+    poses, guides = _pose_claims(path, valid, true, limits), _guide_claims(path, guided, true, limits)
     result: dict[str, Any] = {
         "error": _error_summary(poses.sizes()),
         "by_true_z": _by_range(true, valid, guided, poses.sizes()),
@@ -129,7 +116,7 @@ def _judge(path: Path, fixes: list[Row], true: dict[str, Array]) -> dict[str, An
     return result
 
 
-def _pose_claims(path: Path, rows: list[Row], true: dict[str, Array]) -> PoseClaims:
+def _pose_claims(path: Path, rows: list[Row], true: dict[str, Array], limits: AlertLimits) -> PoseClaims:
     """The valid rows of fixes.csv against the truth."""
     T = [_pose(path, row) for row in rows]
     errors = [claims.pose_error(T_est, true[row["frame"]]) for T_est, row in zip(T, rows, strict=True)]
@@ -140,15 +127,17 @@ def _pose_claims(path: Path, rows: list[Row], true: dict[str, Array]) -> PoseCla
         np.array([_numbers_if_any(path, row, PROTECTION_COLUMNS) for row in rows]).reshape(-1, 3),
         _symmetric(triangles),
         [row.get("stage", "") for row in rows],
+        limits,
     )
 
 
-def _guide_claims(path: Path, rows: list[Row], true: dict[str, Array]) -> GuideClaims:
+def _guide_claims(path: Path, rows: list[Row], true: dict[str, Array], limits: AlertLimits) -> GuideClaims:
     """The rows of fixes.csv with a guide against the truth."""
     return GuideClaims(
         np.array([_numbers(path, row, GUIDE_COLUMNS[:3]) for row in rows]).reshape(-1, 3),
         np.array([claims.true_guide(true[row["frame"]]) for row in rows]).reshape(-1, 3),
         np.array([_numbers_if_any(path, row, GUIDE_COLUMNS[3:]) for row in rows]).reshape(-1, 2),
+        limits,
     )
 
 
@@ -193,7 +182,7 @@ def _numbers(path: Path, row: Row, names: tuple[str, ...]) -> Array:
 
 
 def _numbers_if_any(path: Path, row: Row, names: tuple[str, ...]) -> Array:
-    """The same of fields that are all empty where nothing is known, which is NaN."""
+    """The same, but NaN where all of the fields are empty because the method does not give them."""
     return _numbers(path, row, names) if any(row.get(name) for name in names) else np.full(len(names), np.nan)
 
 
@@ -273,36 +262,69 @@ def layer_offset_m(station: Station, poses: dict[str, dict[str, Array]]) -> floa
     return max(offsets, default=None)
 
 
-def _labels(run_folder: Path, truth_folder: Path, true: dict[str, Array]) -> dict[str, int]:
-    """Named detections of the frames that the truth knows, and those whose light did not make them."""
-    truth_path, path, pixel = truth_folder / "lights_truth.csv", run_folder / "lights.csv", ("u_px", "v_px")
-    lights = {
-        (row["frame"], row["light"]): _numbers(truth_path, row, pixel)
-        for row in read_rows(truth_path, ("frame", "light", *pixel, "visible"))
-        if row["visible"] == "1"
-    }
-    named = [row for row in read_rows(path, ("frame", "light", *pixel)) if row["light"] and row["frame"] in true]
-    wrong = 0
-    for row in named:
-        at, seen = lights.get((row["frame"], row["light"])), _numbers(path, row, pixel)
-        wrong += at is None or bool(np.hypot(*(at - seen)) > _SAME_DETECTION_PX)
-    return {"named": len(named), "wrong": wrong}
+@dataclass(frozen=True, slots=True, eq=False)
+class _TrueLights:
+    """Of one frame: true centres `uv` (K, 2) px by light id, and which of the lights are visible."""
+
+    uv: dict[str, Array]
+    visible: set[str]
+
+    def nearest(self, uv: Array, own: str) -> tuple[str, float]:
+        """The light whose centre is nearest to `uv` (2,) px, and how far that is, among `own` and the visible ones.
+
+        `own` counts although it may not be visible: a lamp that saturates its surroundings has an SNR of 0.
+        """
+        away = {
+            name: float(np.hypot(*(at - uv))) for name, at in self.uv.items() if name == own or name in self.visible
+        }
+        name = min(away, key=lambda name: away[name], default="")
+        return name, away.get(name, np.inf)
+
+
+def _true_lights(path: Path) -> dict[str, _TrueLights]:
+    """The lights of each frame, by its name, from lights_truth.csv."""
+    pixel, frames = ("u_px", "v_px"), dict[str, _TrueLights]()
+    for row in read_rows(path, ("frame", "light", *pixel, "visible")):
+        lights = frames.setdefault(row["frame"], _TrueLights({}, set()))
+        lights.uv[row["light"]] = _numbers(path, row, pixel)
+        if row["visible"] == "1":
+            lights.visible.add(row["light"])
+    return frames
+
+
+def _identities(run_folder: Path, truth_folder: Path, true: dict[str, Array]) -> dict[str, int]:
+    """Detections that were identified as a light, in the frames that the truth knows.
+
+    `wrong`: another lit lamp is nearer to the detection than its own. `displaced`: its own is the nearest, but more
+    than 3 px away, as where a reflection or a lit edge beside the lamp was detected.
+    """
+    lights, path, pixel = _true_lights(truth_folder / "lights_truth.csv"), run_folder / "lights.csv", ("u_px", "v_px")
+    counts = {"identified": 0, "wrong": 0, "displaced": 0}
+    for row in read_rows(path, ("frame", "light", *pixel)):
+        if not row["light"] or row["frame"] not in true:
+            continue
+        seen = lights.get(row["frame"], _TrueLights({}, set()))
+        nearest, away_px = seen.nearest(_numbers(path, row, pixel), row["light"])
+        counts["identified"] += 1
+        counts["wrong"] += nearest != row["light"]
+        counts["displaced"] += nearest == row["light"] and away_px > _SAME_DETECTION_PX
+    return counts
 
 
 def _residual_rms_px(run_folder: Path, poses: dict[str, Array]) -> float | None:
-    """Rms distance of named detections to where the estimated poses, by frame name, put their lights; per coordinate.
+    """Rms distance of identified detections to the pixels where the estimated poses put their lights, per coordinate.
 
-    None without a named detection in a valid frame.
+    `poses` are by frame name. None without an identified detection in a valid frame.
     """
     station, camera = load_station(run_folder / "station.yaml"), load_camera(run_folder / "camera.yaml")
     path, pixel = run_folder / "lights.csv", ("u_px", "v_px")
     index = {light: i for i, light in enumerate(station.ids)}
-    named: dict[str, list[Row]] = {}
+    identified: dict[str, list[Row]] = {}
     for row in read_rows(path, ("frame", "light", *pixel)):
         if row["light"] in index and row["frame"] in poses:
-            named.setdefault(row["frame"], []).append(row)
+            identified.setdefault(row["frame"], []).append(row)
     squares = [np.empty(0)]
-    for frame, rows in named.items():
+    for frame, rows in identified.items():
         p_cam = transform_points(se3_inverse(poses[frame]), station.p_dock[[index[row["light"]] for row in rows]])
         uv = np.array([_numbers(path, row, pixel) for row in rows])
         squares.append(((camera.project(p_cam) - uv) ** 2).ravel())

@@ -1,4 +1,4 @@
-"""Run folders as such: what one was made with and from, and the evaluation of many as one table."""
+"""Finding run folders and what they were made from, and evaluating many of them as one table."""
 
 from __future__ import annotations
 
@@ -9,23 +9,11 @@ from typing import Any
 
 from lumidock.errors import InputError, extra
 from lumidock.evaluation.metrics import evaluate
+from lumidock.evaluation.run_description import read_description
 from lumidock.streams.run_folder import identities
 from lumidock.streams.sources import Source, open_source
 
-_PARTS = ("source", "inputs_sha256", "inputs_sampled", "config", "counts")
-_MOST_DEEP = 4  # folders below the given one in which runs are looked for
-
-
-def described(folder: Path) -> dict[str, Any]:
-    """The run.json of a run folder. Raises: InputError, one line."""
-    path = folder / "run.json"
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
-    if not isinstance(content, dict) or not all(isinstance(content.get(part, {}), dict) for part in _PARTS):
-        raise InputError(f"{path}: not the description of a run")
-    return content
+_MOST_DEEP = 4  # levels of folders, below the given one, that are searched for runs
 
 
 def source_of(folder: Path, description: Mapping[str, Any], given: Path | None = None) -> Source | None:
@@ -82,7 +70,7 @@ def evaluate_all(folder: Path, truth: Path | None = None) -> list[dict[str, Any]
     """
     rows = []
     for run in find_runs(folder):
-        description = described(run)
+        description = read_description(run)
         name = str(run.relative_to(folder)) if run != folder else run.resolve().name
         about = {"run": name, "method": description.get("method"), "cold": description.get("cold")}
         latency = {"latency_us": description.get("counts", {}).get("latency_us", {})}

@@ -1,15 +1,16 @@
-"""A run, or several, as one page for a person, made of the files of the run folders."""
+"""A run, or several, as one HTML page, made from the files of the run folders."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from lumidock.errors import InputError
 from lumidock.evaluation.run_folders import find_runs
 from lumidock.report import figures, page, tables
-from lumidock.report.moments import pictures
-from lumidock.report.page import Section
+from lumidock.report.moments import annotated_images
+from lumidock.report.page import PageSection
 from lumidock.report.view import RunView, load_run
 
 _MOST_RUNS, _MOST_IN_FULL = 12, 3
@@ -30,7 +31,7 @@ def report(
     """
     runs = [run for folder in runs for run in find_runs(folder)]
     if len(runs) > _MOST_RUNS:
-        raise InputError(f"{len(runs)} runs: at most {_MOST_RUNS} fit on a page that a person likes to read")
+        raise InputError(f"{len(runs)} runs: at most {_MOST_RUNS} on one page")
     if len(sources) not in (0, 1, len(runs)):
         raise InputError(f"{len(sources)} sources for {len(runs)} runs: wanted one for all, or one for each")
     given = [None] * len(runs) if not sources else [*sources] * (len(runs) if len(sources) == 1 else 1)
@@ -46,39 +47,47 @@ def report(
     return page.render(_title(views), _lead(views), sections)
 
 
-def sections_of(view: RunView, prefix: str, *, alone: bool, most_pictures: int | None = None) -> list[Section]:
-    """What a page says of one run; `prefix` makes the names of its figures unique."""
+def sections_of(view: RunView, prefix: str, *, alone: bool, most_images: int | None = None) -> list[PageSection]:
+    """The sections about one run, the images first; `prefix` makes the ids of its figures unique on the page."""
     found = {plot.name.removeprefix(f"{prefix}-"): plot for plot in figures.of_run(view, prefix)}
     of = "" if alone else f": {view.name}"
-    shown = pictures(view, (8 if alone else 2) if most_pictures is None else most_pictures)
-    way = [found[name] for name in ("trajectory",) if name in found]
+    shown = annotated_images(view, (8 if alone else 2) if most_images is None else most_images)
+    path = [found[name] for name in ("trajectory",) if name in found]
     errors = [found[name] for name in ("levels", "guide", "stanford") if name in found]
-    worth = [table for table in (tables.by_range(view), tables.trust(view)) if table is not None]
+    judged = [table for table in (tables.by_range(view), tables.integrity(view)) if table is not None]
     why = [table for table in (tables.reasons(view), tables.handover(view)) if table is not None]
-    sections = [Section(f"How it went{of}", tiles=tables.tiles(view), items=way)]
+    sections = [PageSection(f"Result{of}", tiles=tables.tiles(view), items=[*shown[:1], *path])]
     if shown:
-        text = (
-            "Rings are detections with the names of their lights, crosses where the pose puts each light; front lights "
-            "amber, rear lights blue. A red ring with a number was turned down, and why is said below."
-        )
-        sections.append(Section(f"What the camera saw{of}", text, items=shown))
-    if errors or worth:
-        sections.append(Section(f"What it promised{of}", items=[*errors, *worth]))
-    sections.append(Section(f"Lights, stages and reasons{of}", items=[found["lights"], found["states"], *why]))
-    made = [found[name] for name in ("latency",) if name in found]
-    sections.append(Section(f"Time and settings{of}", items=[*made, *tables.versions(view)]))
+        sections[0] = replace(sections[0], text=_legend(view))
+    if shown[1:]:
+        sections.append(PageSection(f"Moments of the run{of}", items=shown[1:]))
+    if errors or judged:
+        sections.append(PageSection(f"Errors and protection levels{of}", items=[*errors, *judged]))
+    sections.append(PageSection(f"Lights, stages and reasons{of}", items=[found["lights"], found["states"], *why]))
+    latency = [found[name] for name in ("latency",) if name in found]
+    sections.append(PageSection(f"Time and settings{of}", items=[*latency, *tables.versions(view)]))
     return sections
 
 
-def _in_brief(view: RunView, prefix: str) -> Section:
-    """One run of many: its numbers, its way, and why it had no pose; the rest is on a page of its own."""
-    way = [figures.trajectory(view, prefix, _POINTS_IN_BRIEF)] if view.valid.any() else []
+def _legend(view: RunView) -> str:
+    """What the marks on the images mean, with the colours of the layers that this dock has."""
+    words = ("amber", "blue", "green", "violet")
+    layers = [f"{layer} {words[k % len(words)]}" for k, layer in enumerate(view.station.layers_front_to_rear())]
+    return (
+        f"A ring is a detection with the id of the light that it was identified as ({', '.join(layers)}); a cross is "
+        "where the pose puts a light. A red ring with a number was not used, for the reason given below the image."
+    )
+
+
+def _in_brief(view: RunView, prefix: str) -> PageSection:
+    """One run of many: its numbers, its trajectory and its reasons; the rest is on the page of that run alone."""
+    path = [figures.trajectory(view, prefix, _POINTS_IN_BRIEF)] if view.valid.any() else []
     why = [table for table in (tables.reasons(view), tables.handover(view)) if table is not None]
-    return Section(view.name, tiles=tables.tiles(view), items=[*way, *why])
+    return PageSection(view.name, tiles=tables.tiles(view), items=[*path, *why])
 
 
-def _together(views: Sequence[RunView]) -> Section:
-    return Section("Side by side", items=[tables.comparison(views), *figures.comparison(views, "all")])
+def _together(views: Sequence[RunView]) -> PageSection:
+    return PageSection("Comparison", items=[tables.comparison(views), *figures.comparison(views, "all")])
 
 
 def _title(views: Sequence[RunView]) -> str:
@@ -87,5 +96,5 @@ def _title(views: Sequence[RunView]) -> str:
 
 def _lead(views: Sequence[RunView]) -> str:
     what = ", ".join(f"{view.name} ({view.described.get('method', '?')})" for view in views)
-    truth = " With truth." if any(view.has_truth for view in views) else " There is no truth to hold it against."
+    truth = " With truth." if any(view.has_truth for view in views) else " There is no truth to compare it with."
     return f"lumidock {views[0].described.get('lumidock', '?')}: {what}.{truth}"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _MOST_POINTS = 700  # of a series; of longer runs every k-th frame is drawn, and all that is over its level
 _ELLIPSES = 14
 _SHOWN = {"lateral": ("lateral, m", 1.0), "axial": ("axial, m", 1.0), "angle": ("angle, deg", 180.0 / np.pi)}
-_LAYER_COLORS = ("front", "rear", "transition", "accent")
+_LAYER_COLORS = ("front", "rear", "transition", "accent")  # variables of the page, in the order of streams.colors
 _RUN_COLORS = ("rear", "front", "transition", "accent", "bad", "search")
 
 
@@ -50,7 +50,7 @@ def _stage_of(view: RunView) -> np.ndarray:
     return np.array([fix.stage for fix in view.fixes])
 
 
-# Where the vehicle was
+# Trajectory
 
 
 def trajectory(view: RunView, prefix: str, most_points: int = _MOST_POINTS) -> Plot:
@@ -149,15 +149,15 @@ def _label_stages(axes: Axes, narrow: bool) -> None:
         )
 
 
-# What its errors are, and what it promised
+# Errors and protection levels
 
 
 def levels(view: RunView, prefix: str) -> Plot:
     """Protection levels, alert limits and, where there is a truth, errors over time."""
     error = "Points are errors against the truth, coloured by stage; the" if view.has_truth else "The"
     caption = (
-        f"What the poses promise, over time in seconds. {error} line is the protection level, which the error passes "
-        "once in a million frames; dotted: the alert limit, over which a pose is not valid. Logarithmic."
+        f"Errors of the poses over time in seconds. {error} line is the protection level, which the error exceeds at "
+        "most once in a million frames; dotted: the alert limit, over which a pose is not valid. Logarithmic."
     )
     return plot(f"{prefix}-levels", caption, lambda f, narrow: _draw_levels(f, narrow, view), (6.2, 7.0))
 
@@ -166,14 +166,14 @@ def _draw_levels(figure: Figure, narrow: bool, view: RunView) -> None:
     keep, panels = _thinned(view), figure.subplots(3, 1, sharex=True)
     for k, (axes, kind) in enumerate(zip(panels, KINDS, strict=True)):
         label, scale = _SHOWN[kind]
-        _draw_promise(axes, view, keep, (view.levels[:, k] * scale, view.limits[:, k] * scale))
+        _draw_level_and_limit(axes, view, keep, (view.levels[:, k] * scale, view.limits[:, k] * scale))
         _scatter_stages(axes, view, keep, view.t_s, np.maximum(view.errors[:, k] * scale, 1e-4), legend=k == 0)
         axes.set_ylabel(label)
     _label_stages(panels[0], narrow)
     panels[-1].set_xlabel("time, s")
 
 
-def _draw_promise(axes: Axes, view: RunView, keep: np.ndarray, level_and_limit: tuple[Array, Array]) -> None:
+def _draw_level_and_limit(axes: Axes, view: RunView, keep: np.ndarray, level_and_limit: tuple[Array, Array]) -> None:
     level, limit = level_and_limit
     axes.plot(view.t_s[keep], level[keep], color=COLORS["rear"], lw=1.2)
     axes.plot(view.t_s[keep], limit[keep], color=COLORS["bad"], lw=1.2, ls=":")
@@ -182,12 +182,12 @@ def _draw_promise(axes: Axes, view: RunView, keep: np.ndarray, level_and_limit: 
 
 
 def guide(view: RunView, prefix: str) -> Plot:
-    """The same of bearing and range, and the range itself."""
+    """Range over time, and protection levels, alert limits and errors of bearing and range."""
     error = "Points are errors against the truth; the" if view.has_truth else "The"
     caption = (
-        "Bearing and range of the dock, over time in seconds: range in metres as the guide says it, then its bearing "
-        f"and its range error. {error} line is the protection level, dotted the alert limit; both end 3 m before the "
-        "dock, where a guide is a valid pose."
+        "Bearing and range of the dock, over time in seconds: the range in metres, then the errors of bearing and "
+        f"range. {error} line is the protection level, dotted the alert limit; both end "
+        f"{view.station.alert_limits.guide.from_m:.3g} m before the dock, from where on the limits of the pose apply."
     )
     return plot(f"{prefix}-guide", caption, lambda f, _narrow: _draw_guide(f, view), (5.6, 6.6))
 
@@ -199,7 +199,7 @@ def _draw_guide(figure: Figure, view: RunView) -> None:
     for axes, k, scale, label in ((panels[1], 0, 180.0 / np.pi, "bearing, deg"), (panels[2], 1, 1.0, "range error, m")):
         limit = np.where(np.isfinite(view.guide_limits[:, k]), view.guide_limits[:, k], np.nan)
         far = keep & np.isfinite(limit)
-        _draw_promise(axes, view, far, (view.guide_levels[:, k] * scale, limit * scale))
+        _draw_level_and_limit(axes, view, far, (view.guide_levels[:, k] * scale, limit * scale))
         _scatter_stages(axes, view, far, view.t_s, np.maximum(view.guide_errors[:, k] * scale, 1e-4))
         axes.set_ylabel(label)
     panels[-1].set_xlabel("time, s")
@@ -209,8 +209,8 @@ def stanford(view: RunView, prefix: str) -> Plot:
     """Error against protection level, both as shares of the alert limit."""
     caption = (
         "Stanford diagram: each valid pose by its error and its protection level, both divided by its alert limit. "
-        "Above the diagonal the pose kept its promise; below it the error was over its level (misleading); in the "
-        "shaded corner it was over the alert limit as well (hazardous), where nothing may ever be."
+        "Above the diagonal the error is within its level; below it the error is over its level (misleading); in the "
+        "shaded corner it is over the alert limit as well (hazardous), where no point should be."
     )
     return plot(f"{prefix}-stanford", caption, lambda f, narrow: _draw_stanford(f, narrow, view), (3.9, 9.6))
 
@@ -231,15 +231,15 @@ def _draw_stanford(figure: Figure, narrow: bool, view: RunView) -> None:
             axes.set_ylabel("level / alert limit")
 
 
-# What was seen, and what it was taken for
+# Lights, stages and reasons
 
 
 def lights(view: RunView, prefix: str) -> Plot:
-    """A row for each light: when it was named."""
-    truth = " Grey: it could be seen, by the truth." if view.visible is not None else ""
+    """A row for each light: when it was identified."""
+    truth = " Grey: it was visible, by the truth." if view.visible is not None else ""
     caption = (
-        f"When each light was named, over time in seconds; a row a light, coloured by layer.{truth} Below: the number "
-        "of detections that were taken for no light."
+        f"When each light was identified, over time in seconds; a row for each light, coloured by layer.{truth} Below: "
+        "the number of detections that were identified as no light (spurious, or not used)."
     )
     rows = len(view.station.ids)
     return plot(
@@ -252,23 +252,23 @@ def _draw_lights(figure: Figure, view: RunView) -> None:
     axes, below = figure.subplots(2, 1, sharex=True, height_ratios=[len(ids), 2.6])
     order = [int(light) for layer in layers for light in view.station.lights_of(layer)]
     for row, light in enumerate(order):
-        named = np.array([fix.match is not None and bool((fix.match.light == light).any()) for fix in view.fixes])
+        identified = np.array([fix.match is not None and bool((fix.match.light == light).any()) for fix in view.fixes])
         color = _LAYER_COLORS[layers.index(view.station.layers[view.station.layer[light]]) % len(_LAYER_COLORS)]
         if view.visible is not None:
             axes.broken_barh(_spans(view, view.visible[:, light]), (row - 0.42, 0.84), color=COLORS["line"], lw=0)
-        axes.broken_barh(_spans(view, named), (row - 0.28, 0.56), color=COLORS[color], lw=0)
+        axes.broken_barh(_spans(view, identified), (row - 0.28, 0.56), color=COLORS[color], lw=0)
     axes.set_yticks(range(len(order)), [ids[light] for light in order])
     axes.set_ylim(len(order) - 0.4, -0.6)
     axes.grid(axis="y", visible=False)
     spurious = [0 if fix.match is None else int((fix.match.light < 0).sum()) for fix in view.fixes]
     below.step(view.t_s, spurious, where="post", color=COLORS["bad"], lw=1)
-    below.set(ylabel="turned\ndown", xlabel="time, s", ylim=(0, max(*spurious, 3) * 1.1))
+    below.set(ylabel="not\nused", xlabel="time, s", ylim=(0, max(*spurious, 3) * 1.1))
 
 
 def _spans(view: RunView, which: np.ndarray) -> list[tuple[float, float]]:
-    """Stretches (start s, length s) of the frames (N,) that are meant, each up to the frame after it.
+    """Stretches (start s, length s) of the frames (N,) that `which` marks, each up to the frame after it.
 
-    In long runs frames are taken together, so that a single one is still seen.
+    In long runs neighbouring frames are merged, so that a single one is still wide enough to be seen.
     """
     known = np.isfinite(view.t_s)
     starts = np.arange(0, known.sum(), max(1, -(-int(known.sum()) // _MOST_POINTS)))
@@ -284,10 +284,14 @@ def _spans(view: RunView, which: np.ndarray) -> list[tuple[float, float]]:
 
 
 def states(view: RunView, prefix: str) -> Plot:
-    """Stages and hand-over, what could be used, and why there was no pose."""
+    """Docking stages, frames with a pose or a guide, and the reasons for no pose."""
+    layers = view.station.layers_front_to_rear()
+    stages = (
+        "the docking stage" if len(layers) > 1 else f"the docking stage (front: the dock's only layer, {layers[0]})"
+    )
     caption = (
-        "Stages and hand-over, over time in seconds: the docking stage, frames with a valid pose, frames with bearing "
-        "and range (guide), and, a row for each, the reasons why there was no valid pose."
+        f"Over time in seconds: {stages}, frames with a valid pose, frames with bearing and range (guide), and a row "
+        "for each reason why there was no valid pose."
     )
     reasons = sorted({fix.reason for fix in view.fixes if fix.reason})
     height = 1.3 + 0.24 * (3 + len(reasons))
@@ -297,7 +301,8 @@ def states(view: RunView, prefix: str) -> Plot:
 def _draw_states(figure: Figure, view: RunView, reasons: Sequence[str]) -> None:
     axes, stage = figure.subplots(), _stage_of(view)
     for name in STAGES:
-        axes.broken_barh(_spans(view, stage == name), (-0.38, 0.76), color=COLORS[name], lw=0, label=name)
+        if (stage == name).any():
+            axes.broken_barh(_spans(view, stage == name), (-0.38, 0.76), color=COLORS[name], lw=0, label=name)
     rows = [("valid", view.valid, "transition"), ("guide", view.guided, "rear")]
     rows += [(word, np.array([fix.reason == word for fix in view.fixes]), "bad") for word in reasons]
     for row, (_, which, color) in enumerate(rows, start=1):
@@ -312,7 +317,7 @@ def _draw_states(figure: Figure, view: RunView, reasons: Sequence[str]) -> None:
 
 
 def latency(views: Sequence[RunView], prefix: str) -> Plot:
-    """How long frames took."""
+    """Histogram of the time that a frame took."""
     caption = "Time that a frame took in milliseconds, decoding excluded; logarithmic. Dashed: the 95th percentile."
     return plot(f"{prefix}-latency", caption, lambda f, _narrow: _draw_latency(f, views), (2.8, 2.9))
 
@@ -343,11 +348,11 @@ def comparison(views: Sequence[RunView], prefix: str) -> list[Plot]:
     figures = []
     if any(np.isfinite(view.errors).any() for view in views):
         caption = (
-            "Errors of the valid poses over the true distance z before the entrance plane in metres; logarithmic. A "
-            "colour a run."
+            "Errors of the valid poses over the true distance z before the entrance plane in metres; logarithmic. Each "
+            "run has its colour."
         )
         figures.append(plot(f"{prefix}-errors", caption, lambda f, narrow: _draw_errors(f, narrow, views), (6.2, 7.0)))
-    caption = "When each run had a valid pose (thick) and bearing and range (thin), over time in seconds; a row a run."
+    caption = "When each run had a valid pose (thick) and bearing and range (thin), over time in seconds."
     height = 1.0 + 0.42 * len(views)
     figures.append(plot(f"{prefix}-use", caption, lambda f, _narrow: _draw_use(f, views), (height, height)))
     timed = [view for view in views if np.isfinite(view.latency_ms).any()]

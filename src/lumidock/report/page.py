@@ -1,4 +1,4 @@
-"""A page for a person: sections of figures, tables and pictures in one HTML file that needs nothing else."""
+"""A page of sections with figures, tables and images, in one HTML file that loads nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from lumidock.errors import InputError, extra
+from lumidock.streams.colors import ON_NIGHT, ON_PAPER, STAGES_ON_NIGHT, STAGES_ON_PAPER
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +36,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Something drawn over a picture, at `x`, `y` px of it: a ring of radius `r`, or a cross when `r` is 0."""
+    """Something drawn over an image, at `x`, `y` px of it: a ring of radius `r`, or a cross when `r` is 0."""
 
     x: float
     y: float
@@ -45,10 +46,10 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """A JPEG with marks over it, and `notes` below it."""
+class AnnotatedImage:
+    """A JPEG image with marks over it, and `notes` below it."""
 
-    kind: ClassVar[str] = "picture"
+    kind: ClassVar[str] = "image"
     title: str
     caption: str
     jpeg_base64: str
@@ -60,7 +61,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """Text as it is, folded away below its caption."""
+    """Preformatted text that is folded away below its caption until it is opened."""
 
     kind: ClassVar[str] = "listing"
     caption: str
@@ -69,7 +70,7 @@ class Listing:
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """One number that matters, what it is, and whether it is `good`, `bad` or neither."""
+    """One number in a card, what it means, and whether it is `good`, `bad` or neither."""
 
     value: str
     label: str
@@ -77,22 +78,28 @@ class Tile:
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class PageSection:
     """A part of a page under its own title."""
 
     title: str
     text: str = ""
     tiles: Sequence[Tile] = ()
-    items: Sequence[Plot | Table | Picture | Listing] = field(default=())
+    items: Sequence[Plot | Table | AnnotatedImage | Listing] = field(default=())
 
 
-def render(title: str, lead: str, sections: Sequence[Section]) -> str:
+def render(title: str, lead: str, sections: Sequence[PageSection]) -> str:
     """The page as HTML; all text in it is escaped. Raises: InputError when jinja2 is not installed (extra `report`)."""
     with extra("report"):
         from jinja2 import Environment, StrictUndefined
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((files("lumidock.report") / "page.html.j2").read_text(encoding="utf-8"))
-    return template.render(title=title, lead=lead, sections=sections)
+    themes = {"paper": _theme(ON_PAPER, STAGES_ON_PAPER), "night": _theme(ON_NIGHT, STAGES_ON_NIGHT)}
+    return template.render(title=title, lead=lead, sections=sections, themes=themes)
+
+
+def _theme(layers: tuple[str, ...], stages: dict[str, str]) -> str:
+    """The variables of the style sheet for layers and stages, from their one definition."""
+    return " ".join(f"--{name}: {color};" for name, color in (stages | {"accent": layers[3]}).items())
 
 
 def write(path: Path, text: str) -> None:
@@ -111,5 +118,5 @@ def markdown(table: Table) -> str:
 
 
 def escaped(text: str) -> str:
-    """Text that may stand in an SVG attribute."""
+    """Text made safe for an SVG attribute."""
     return html.escape(text, quote=True)

@@ -1,15 +1,15 @@
-"""A picture of a dock: its lights from the front and from above, and the protection levels to expect on an approach."""
+"""A drawing of a dock: its lights from the front and from above, and the protection levels expected on an approach."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from lumidock.errors import extra
-from lumidock.integrity import alert_limit
-from lumidock.station import Station
+import numpy as np
 
-_LAYER_COLORS = ("#d9860a", "#2f6fd0", "#2a9d5c", "#8a4fbf")
+from lumidock.errors import extra
+from lumidock.station import Station
+from lumidock.streams.colors import ON_PAPER, of_layer
 
 
 def draw_station(station: Station, result: dict[str, Any], out: Path) -> None:
@@ -24,10 +24,10 @@ def draw_station(station: Station, result: dict[str, Any], out: Path) -> None:
     FigureCanvasAgg(figure)
     axes = figure.subplot_mosaic([["front", "above"], ["levels", "levels"]])
     front, above, levels = axes["front"], axes["above"], axes["levels"]
-    for number, layer in enumerate(station.layers_front_to_rear()):
+    for layer in station.layers_front_to_rear():
         lights = station.lights_of(layer)
         x, y, z = station.p_dock[lights].T
-        color = _LAYER_COLORS[number % len(_LAYER_COLORS)]
+        color = of_layer(station, int(lights[0]), ON_PAPER)
         front.scatter(x, y, color=color, label=layer, s=50)
         above.scatter(z, x, color=color, s=50)
         for light in lights:
@@ -42,17 +42,18 @@ def draw_station(station: Station, result: dict[str, Any], out: Path) -> None:
     front.legend(loc="best")
     above.set(xlabel="z, m (toward the vehicle)", ylabel="x, m", title="from above")
     above.margins(0.2)
-    _draw_levels(levels, result)
+    _draw_levels(levels, station, result)
     figure.savefig(out, dpi=110)
 
 
-def _draw_levels(axes: Any, result: dict[str, Any]) -> None:  # noqa: ANN401  # matplotlib is optional
+def _draw_levels(axes: Any, station: Station, result: dict[str, Any]) -> None:  # noqa: ANN401  # matplotlib is optional
     rows = [row for row in result["corridor"] if row["lateral_m"] is not None]
     z = [row["z_m"] for row in rows]
-    for name, color in (("lateral_m", "#c0392b"), ("axial_m", "#2f6fd0")):
-        axes.semilogy(z, [row[name] for row in rows], color=color, marker=".", label=f"{name.split('_')[0]} level, m")
-    limits = [alert_limit(row["z_m"], row["axial_m"])[0] for row in rows]
-    axes.semilogy(z, limits, color="black", linestyle="--", label="alert limit, m")
+    limits = np.array([station.alert_limits.of_pose(row["z_m"], row["axial_m"])[:2] for row in rows]).reshape(-1, 2)
+    for k, (name, color) in enumerate((("lateral_m", ON_PAPER[0]), ("axial_m", ON_PAPER[1]))):
+        word = name.removesuffix("_m")
+        axes.semilogy(z, [row[name] for row in rows], color=color, marker=".", label=f"{word} level, m")
+        axes.semilogy(z, limits[:, k], color=color, linestyle="--", label=f"{word} alert limit, m")
     axes.invert_xaxis()
     axes.set(xlabel="z, m", title="expected protection levels on a head-on approach")
     axes.grid(alpha=0.3)

@@ -1,4 +1,4 @@
-"""Pictures of a run: the trajectory against the truth, and a sheet of annotated frames."""
+"""Image files of a run: the trajectory against the truth, and a sheet of annotated frames."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ import numpy as np
 from lumidock.datatypes import Array, Fix, Image
 from lumidock.errors import extra
 from lumidock.station import Station
+from lumidock.streams.colors import ON_PAPER, STAGES_ON_PAPER
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-_STAGE_COLORS = {"search": "#7f7f7f", "front": "#d9860a", "transition": "#2a9d5c", "rear": "#2f6fd0"}
 
 
 def plot_trajectory(fixes: Sequence[Fix], truth: dict[str, Array], station: Station, out: Path) -> None:
@@ -35,13 +34,15 @@ def plot_trajectory(fixes: Sequence[Fix], truth: dict[str, Array], station: Stat
     at = np.array([fix.T_dock_cam[:3, 3] for fix in valid if fix.T_dock_cam is not None]).reshape(-1, 3)
     for axes, column, label in ((top, 0, "x, m (right)"), (side, 1, "y, m (up)")):
         axes.plot(true[:, 2], true[:, column], color="black", linewidth=1, label="truth")
-        axes.scatter(station.p_dock[:, 2], station.p_dock[:, column], marker="*", s=40, color="#c9a400", label="lights")
+        axes.scatter(
+            station.p_dock[:, 2], station.p_dock[:, column], marker="*", s=40, color=ON_PAPER[3], label="lights"
+        )
         _scatter_by_stage(axes, valid, at[:, 2], at[:, column])
         reach = 1.3 * max(1.0, float(np.abs(true[:, column]).max()))
         axes.set_ylim(-reach, reach)
         axes.set_ylabel(label)
-    missed = at - np.array([truth[fix.frame][:3, 3] for fix in valid]).reshape(-1, 3)
-    _scatter_by_stage(error, valid, at[:, 2], np.maximum(np.linalg.norm(missed, axis=1), 1e-6))
+    error_m = at - np.array([truth[fix.frame][:3, 3] for fix in valid]).reshape(-1, 3)
+    _scatter_by_stage(error, valid, at[:, 2], np.maximum(np.linalg.norm(error_m, axis=1), 1e-6))
     error.set_yscale("log")
     error.set_ylabel("position error, m")
     error.set_xlabel("z, m: distance before the entrance plane; shaded: inside the dock")
@@ -49,14 +50,14 @@ def plot_trajectory(fixes: Sequence[Fix], truth: dict[str, Array], station: Stat
     top.set_title("Camera in the dock frame: from above, from the side, and how far from the truth", loc="left")
     top.legend(loc="upper right", ncols=3, fontsize=8)
     for axes in (top, side, error):
-        axes.axvspan(0.0, float(station.p_dock[:, 2].min()), color="#2f6fd0", alpha=0.07)
+        axes.axvspan(0.0, float(station.p_dock[:, 2].min()), color=ON_PAPER[1], alpha=0.07)
         axes.grid(alpha=0.25)
     figure.savefig(out, dpi=110)
 
 
 def _scatter_by_stage(axes: Axes, fixes: Sequence[Fix], z: Array, values: Array) -> None:
     """Points over z, coloured by the docking stage of each of the N `fixes`; `z` (N,), `values` (N,)."""
-    for stage, color in _STAGE_COLORS.items():
+    for stage, color in STAGES_ON_PAPER.items():
         inside = np.array([fix.stage == stage for fix in fixes], bool)
         if inside.any():
             axes.scatter(z[inside], values[inside], s=9, color=color, label=f"{stage} stage")

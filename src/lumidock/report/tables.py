@@ -17,23 +17,34 @@ from lumidock.report.page import Listing, Table, Tile
 from lumidock.report.view import STAGES, RunView
 
 _WHY = {
-    "no_lights": "no spot in the picture that could be a lamp",
+    "no_lights": "no detection in the image that could be a lamp",
     "too_few": "too few lights for a pose",
-    "too_many": "more spots than the method looks at",
-    "ambiguous": "more than one naming of the spots fits about as well",
+    "too_many": "more detections than the method examines",
+    "ambiguous": "several associations of detections with lights fit about as well",
+    "unproven": "one association fits, but its evidence does not yet meet the risk",
     "mirror": "the mirror image of the dock fits about as well",
-    "inconsistent": "the spots fit no arrangement of the dock's lights",
-    "residual": "the named spots do not lie where any one pose puts them",
+    "inconsistent": "the detections fit no assignment to the dock's lights",
+    "residual": "the identified detections do not lie where any one pose puts their lights",
     "protection": "a pose was found, but its protection level is over the alert limit",
-    "stale": "no light for too long to go on predicting",
-    "frozen": "the picture does not change any more",
-    "bad_frame": "the picture could not be read or does not fit the calibration",
-    "bad_stamp": "the time stamp is missing or does not follow the one before",
+    "saturated": "as protection, and the lights are overexposed: a shorter exposure helps",
+    "calibration": "the detections contradict the camera calibration",
+    "survey": "the detections contradict the positions in the station file",
+    "stale": "no light was detected for too long to go on predicting",
+    "frozen": "the camera repeats the same image",
+    "bad_frame": "the image could not be read or does not fit the calibration",
+    "bad_stamp": "the time stamp is missing or is not later than the one before",
 }
 
 
+# the squared error of the pose divided by its covariance, which has 6 degrees of freedom
+NEES_MEANS = (
+    "6 on average where the covariances are right; more means that they are too small, less that they are too wide, as "
+    "where survey and calibration are better than the station file states"
+)
+
+
 def tiles(view: RunView) -> list[Tile]:
-    """The numbers that a person asks for first."""
+    """The most important numbers of a run."""
     n, counts = len(view.fixes), [int(view.valid.sum()), int(view.guided.sum())]
     found = [
         Tile(str(n), "frames"),
@@ -49,13 +60,15 @@ def tiles(view: RunView) -> list[Tile]:
 
 def _tiles_of_truth(evaluation: dict[str, Any]) -> list[Tile]:
     hazards = sum(evaluation["hazardous"][word]["any"] for word in ("valid", "guide"))
-    found = [Tile(str(hazards), "frames over an alert limit though valid or guiding", "bad" if hazards else "good")]
+    found = [
+        Tile(str(hazards), "hazardous: valid or guide with an error over the alert limit", "bad" if hazards else "good")
+    ]
     if evaluation["error"]:
         lateral = evaluation["error"]["lateral_m"]
         found.append(Tile(f"{lateral['median']:.3f} m", f"lateral error, median (95 %: {lateral['p95']:.3f} m)"))
-    if "labels" in evaluation:
-        wrong = evaluation["labels"]["wrong"]
-        found.append(Tile(str(wrong), f"wrong names of {evaluation['labels']['named']}", "bad" if wrong else "good"))
+    if "identities" in evaluation:
+        wrong, among = evaluation["identities"]["wrong"], evaluation["identities"]["identified"]
+        found.append(Tile(str(wrong), f"wrong identities of {among}", "bad" if wrong else "good"))
     return found
 
 
@@ -74,7 +87,7 @@ def reasons(view: RunView) -> Table | None:
 
 
 def _longest(view: RunView, word: str) -> str:
-    """The longest row of frames with one reason."""
+    """The longest unbroken stretch of frames with one reason."""
     best = current = start = first = 0
     for k, fix in enumerate(view.fixes):
         current, first = (current + 1, first if current else k) if fix.reason == word else (0, k)
@@ -112,8 +125,8 @@ def by_range(view: RunView) -> Table | None:
     return Table("Errors, median / 95 %, of the valid poses over true distance before the entrance plane.", head, rows)
 
 
-def trust(view: RunView) -> Table | None:
-    """What the run's own claims are worth."""
+def integrity(view: RunView) -> Table | None:
+    """Whether the run's alert limits, protection levels and covariances hold against the truth."""
     if view.evaluation is None:
         return None
     e = view.evaluation
@@ -127,11 +140,21 @@ def trust(view: RunView) -> Table | None:
         if row["frames"]
     ]
     if e["nees"]["frames"]:
-        rows.append(["NEES (6 is honest)", f"{e['nees']['mean']:.2f} over {e['nees']['frames']} frames"])
+        rows.append(
+            ["NEES of the covariance", f"{e['nees']['mean']:.2f} over {e['nees']['frames']} frames; {NEES_MEANS}"]
+        )
     for word, gaps in e["continuity"].items():
         if gaps["longest_gap_s"] is not None:
             rows.append([f"longest gap in {word}", f"{gaps['longest_gap_s']:.2f} s; over 0.45 s: {gaps['long_gaps']}"])
-    return Table("What the run's own claims are worth against the truth.", ["claim", "seen"], rows)
+    if e.get("identities"):
+        counts = e["identities"]
+        rows.append(
+            ["identified detections nearer to another lit light", f"{counts['wrong']} of {counts['identified']}"]
+        )
+        text = f"{counts['displaced']} of {counts['identified']}"
+        rows.append(["identified detections over 3 px from their light", text])
+    limits = f"Alert limits of the dock: {view.station.alert_limits.as_text()}."
+    return Table(f"Whether the stated errors hold against the truth. {limits}", ["what", "frames or value"], rows)
 
 
 def versions(view: RunView) -> list[Table | Listing]:
@@ -140,16 +163,17 @@ def versions(view: RunView) -> list[Table | Listing]:
     source = d.get("source", {})
     rows = [
         ["lumidock", str(d.get("lumidock", "?"))],
-        ["method", f"{d.get('method', '?')}{', every frame cold' * bool(d.get('cold'))}"],
+        ["method", f"{d.get('method', '?')}{', every frame without history' * bool(d.get('cold'))}"],
         ["source", f"{source.get('kind', '?')} {source.get('name', '?')}"],
         ["station", f"{view.station.name}, {len(view.station.ids)} lights in {', '.join(view.station.layers)}"],
         ["camera", f"{view.camera.width} x {view.camera.height} px"],
         *([name, f"sha256 {digest}"] for name, digest in d.get("inputs_sha256", {}).items()),
         *([name, _sampled(seen)] for name, seen in d.get("inputs_sampled", {}).items()),
+        ["alert limits", view.station.alert_limits.as_text()],
         ["settings that differ", _different(d.get("config", {}))],
         ["this page", f"Python {platform.python_version()}, OpenCV {cv2.__version__}, numpy {np.__version__}"],
     ]
-    table = Table("Made from and with.", ["what", "value"], [[a, str(b)] for a, b in rows])
+    table = Table("What the run was made from and with.", ["what", "value"], [[a, str(b)] for a, b in rows])
     settings = yaml.safe_dump(d.get("config", {}), sort_keys=False, allow_unicode=True)
     counts = json.dumps(d.get("counts", {}), indent=1)
     return [table, Listing("All settings of the run", settings), Listing("Counts as run.json has them", counts)]
@@ -177,9 +201,9 @@ def _leaves(content: Any, path: str = "") -> dict[str, Any]:  # noqa: ANN401  # 
 
 
 def comparison(views: Sequence[RunView]) -> Table:
-    """A column a run."""
+    """The numbers of several runs, a column for each."""
     lines: dict[str, Callable[[RunView], str]] = {
-        "method": lambda v: f"{v.described.get('method', '?')}{', cold' * bool(v.described.get('cold'))}",
+        "method": lambda v: f"{v.described.get('method', '?')}{', without history' * bool(v.described.get('cold'))}",
         "frames": lambda v: str(len(v.fixes)),
         "valid": lambda v: _share(v.valid),
         "guide": lambda v: _share(v.guided),
@@ -191,7 +215,9 @@ def comparison(views: Sequence[RunView]) -> Table:
         "lateral error, median / 95 %, m": lambda v: _error(v, "lateral_m"),
         "axial error, m": lambda v: _error(v, "axial_m"),
         "angle error, deg": lambda v: _error(v, "angle_deg"),
-        "wrong names": lambda v: _from(v, lambda e: f"{e['labels']['wrong']} of {e['labels']['named']}"),
+        "wrong identities": lambda v: _from(
+            v, lambda e: f"{e['identities']['wrong']} of {e['identities']['identified']}"
+        ),
         "latency, median, ms": lambda v: (
             f"{np.nanmedian(v.latency_ms):.2f}" if np.isfinite(v.latency_ms).any() else "-"
         ),

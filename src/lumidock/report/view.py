@@ -1,4 +1,4 @@
-"""A run folder as arrays for its report, with the truth and the pictures where they are at hand."""
+"""A run folder as arrays for its report, with the truth and the images where they are at hand."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from typing import Any, get_args
 
 import numpy as np
 
+from lumidock.alert_limits import AlertLimits
 from lumidock.camera import Camera, load_camera
 from lumidock.datatypes import Array, Fix, Stage
 from lumidock.errors import InputError
 from lumidock.evaluation import run_folders
-from lumidock.evaluation.claims import GuideClaims, PoseClaims, pose_error, true_guide
+from lumidock.evaluation.claims import GuideClaims, error_sizes, pose_error, true_guide
 from lumidock.evaluation.metrics import evaluate, read_rows, true_poses
+from lumidock.evaluation.run_description import read_description
 from lumidock.station import Station, load_station
 from lumidock.streams.replay import read_fixes
 from lumidock.streams.sources import Source
@@ -71,11 +73,11 @@ class RunView:
 
 
 def load_run(folder: Path, source: Path | None = None) -> RunView:
-    """Read a run folder; pictures and truth from `source`, or from the sequence found beside or in the run.
+    """Read a run folder; images and truth from `source`, or from the sequence found beside or in the run.
 
     Raises: InputError, one line, for a folder that is no run, or a source that it was not made from.
     """
-    description = run_folders.described(folder)
+    description = read_description(folder)
     station, camera = load_station(folder / "station.yaml"), load_camera(folder / "camera.yaml")
     rows = list(read_fixes(folder, station.ids))
     if not rows:
@@ -84,26 +86,29 @@ def load_run(folder: Path, source: Path | None = None) -> RunView:
     opened = run_folders.source_of(folder, description, source)
     truth = _truth_of(opened)
     start = next((t for _, t, _ in rows if t is not None), 0)
-    guide, guide_levels, guide_limits, guide_errors = _guide_columns(fixes, truth)
+    guide, guide_levels, guide_limits, guide_errors = _guide_columns(fixes, truth, station.alert_limits)
+    position, levels, limits = _pose_columns(fixes, station.alert_limits)
     return RunView(
-        "/".join(folder.resolve().parts[-2:]),
-        folder,
-        station,
-        camera,
-        description,
-        fixes,
-        np.array([np.nan if t is None else (t - start) * 1e-9 for _, t, _ in rows]),
-        np.array([np.nan if us is None else us * 1e-3 for _, _, us in rows]),
-        *_pose_columns(fixes),
-        guide,
-        guide_levels,
-        guide_limits,
-        _true_positions(fixes, truth),
-        _pose_errors(fixes, truth),
-        guide_errors,
-        _visible(fixes, station, opened),
-        opened,
-        evaluate(folder, opened.path) if truth and opened is not None else None,
+        name="/".join(folder.resolve().parts[-2:]),
+        folder=folder,
+        station=station,
+        camera=camera,
+        described=description,
+        fixes=fixes,
+        t_s=np.array([np.nan if t is None else (t - start) * 1e-9 for _, t, _ in rows]),
+        latency_ms=np.array([np.nan if us is None else us * 1e-3 for _, _, us in rows]),
+        position=position,
+        levels=levels,
+        limits=limits,
+        guide=guide,
+        guide_levels=guide_levels,
+        guide_limits=guide_limits,
+        true_position=_true_positions(fixes, truth),
+        errors=_pose_errors(fixes, truth),
+        guide_errors=guide_errors,
+        visible=_visible(fixes, station, opened),
+        source=opened,
+        evaluation=evaluate(folder, opened.path) if truth and opened is not None else None,
     )
 
 
@@ -114,7 +119,7 @@ def _truth_of(source: Source | None) -> dict[str, Array]:
     return true_poses(source.path)
 
 
-def _pose_columns(fixes: list[Fix]) -> tuple[Array, Array, Array]:
+def _pose_columns(fixes: list[Fix], limits: AlertLimits) -> tuple[Array, Array, Array]:
     """Positions, protection levels and alert limits of the frames, each (N, 3)."""
     position, levels = np.full((len(fixes), 3), np.nan), np.full((len(fixes), 3), np.nan)
     for k, fix in enumerate(fixes):
@@ -122,12 +127,11 @@ def _pose_columns(fixes: list[Fix]) -> tuple[Array, Array, Array]:
             position[k] = fix.T_dock_cam[:3, 3]
         if fix.protection is not None:
             levels[k] = fix.protection.lateral_m, fix.protection.axial_m, fix.protection.angle_rad
-    n = len(fixes)
-    claims = PoseClaims(position[:, 2], np.zeros((n, 6)), levels, np.zeros((n, 6, 6)), [""] * n)
-    return position, levels, np.where(np.isfinite(position[:, 2:]), claims.limits(), np.nan)
+    at_fixes = limits.of_poses(position[:, 2], np.nan_to_num(levels[:, 1]))
+    return position, levels, np.where(np.isfinite(position[:, 2:]), at_fixes, np.nan)
 
 
-def _guide_columns(fixes: list[Fix], truth: dict[str, Array]) -> tuple[Array, Array, Array, Array]:
+def _guide_columns(fixes: list[Fix], truth: dict[str, Array], limits: AlertLimits) -> tuple[Array, Array, Array, Array]:
     """Guides (N, 3), their levels and limits (N, 2), and their errors (N, 2)."""
     n = len(fixes)
     guide, levels, true = np.full((n, 3), np.nan), np.full((n, 2), np.nan), np.full((n, 3), np.nan)
@@ -137,7 +141,7 @@ def _guide_columns(fixes: list[Fix], truth: dict[str, Array]) -> tuple[Array, Ar
             levels[k] = fix.guide.pl_bearing_rad, fix.guide.pl_range_m
         if fix.frame in truth:
             true[k] = true_guide(truth[fix.frame])
-    claims = GuideClaims(guide, true, levels)
+    claims = GuideClaims(guide, true, levels, limits)
     known = np.isfinite(guide[:, 2:])
     return guide, levels, np.where(known, claims.limits(), np.nan), np.where(known, claims.sizes(), np.nan)
 
@@ -154,8 +158,7 @@ def _pose_errors(fixes: list[Fix], truth: dict[str, Array]) -> Array:
     for k, fix in enumerate(fixes):
         if fix.T_dock_cam is not None and fix.frame in truth:
             errors[k] = pose_error(fix.T_dock_cam, truth[fix.frame])
-    unknown = np.full((n, 3), np.nan)
-    return PoseClaims(unknown[:, 0], errors, unknown, np.full((n, 6, 6), np.nan), [""] * n).sizes()
+    return error_sizes(errors)
 
 
 def _visible(fixes: list[Fix], station: Station, source: Source | None) -> np.ndarray | None:

@@ -12,7 +12,7 @@ from typing import Any
 from lumidock.errors import InputError
 from lumidock.evaluation.campaign import read_json, write_whole
 from lumidock.report import page
-from lumidock.report.page import Section, Table
+from lumidock.report.page import PageSection, Table
 from lumidock.reproduce.experiments import jobs_of
 from lumidock.reproduce.grid import FULL, QUICK, Grid
 from lumidock.reproduce.jobs import Progress, run_jobs
@@ -61,7 +61,7 @@ def _prepare(out: Path, force: bool) -> None:
     write_whole(mark, json.dumps({"what": "lumidock reproduce"}))
 
 
-def _tables(sections: Sequence[Section]) -> str:
+def _tables(sections: Sequence[PageSection]) -> str:
     """All tables of the page as Markdown, under the titles of their sections."""
     parts = []
     for section in sections:

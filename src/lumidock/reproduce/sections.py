@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from lumidock.report import figures
-from lumidock.report.moments import pictures
-from lumidock.report.page import Section, Table, Tile, markdown
+from lumidock.report.moments import annotated_images
+from lumidock.report.page import PageSection, Table, Tile, markdown
 from lumidock.report.view import load_run
 from lumidock.reproduce import plots
 from lumidock.reproduce.detector import detector_table
@@ -37,18 +37,18 @@ _SHOWN_PICTURES = 6
 _END_M = 0.25  # a frame is so near to the docking plane when it is the last of a coarse run
 
 
-def sections_of(grid: Grid, results: Results, out: Path) -> list[Section]:
+def sections_of(grid: Grid, results: Results, out: Path) -> list[PageSection]:
     """All sections, in the order of the paper, and then what it left open."""
     return [
         _summary(results),
-        Section("Table 1: names with lights missing and spurious", _TABLE_1_TEXT, items=[_table_1(results)]),
-        Section("Figures 6, 7 and 11: the swarm and the filter", _FILTER_TEXT, items=_filter(results)),
-        Section("Figures 9 and 10: at 9, 5 and 3 m", items=[_distances(results)]),
-        Section("Figures 12 and 13: the rectangular search", _SEARCH_TEXT, items=_search(results, out)),
-        Section("Figures 15 and 16: the docking", _DOCKING_TEXT, items=_docking(results, out)),
-        Section("Cold starts that the paper leaves open", _COLD_TEXT, items=[_cold(results)]),
-        Section("Turbidity, exposure and light from above", _ENVELOPE_TEXT, items=_envelope(grid, results)),
-        Section("Nothing hazardously misleading", _HAZARD_TEXT, items=_hazards(results)),
+        PageSection("Table 1: names with lights missing and spurious", _TABLE_1_TEXT, items=[_table_1(results)]),
+        PageSection("Figures 6, 7 and 11: the swarm and the filter", _FILTER_TEXT, items=_filter(results)),
+        PageSection("Figures 9 and 10: at 9, 5 and 3 m", items=[_distances(results)]),
+        PageSection("Figures 12 and 13: the rectangular search", _SEARCH_TEXT, items=_search(results, out)),
+        PageSection("Figures 15 and 16: the docking", _DOCKING_TEXT, items=_docking(results, out)),
+        PageSection("Cold starts that the paper leaves open", _COLD_TEXT, items=[_cold(results)]),
+        PageSection("Turbidity, exposure and light from above", _ENVELOPE_TEXT, items=_envelope(grid, results)),
+        PageSection("Nothing hazardously misleading", _HAZARD_TEXT, items=_hazards(results)),
     ]
 
 
@@ -104,14 +104,14 @@ def summary_table(results: Results) -> str:
     return markdown(_summary_table(results)[0]).partition("\n\n")[2].strip()
 
 
-def _summary(results: Results) -> Section:
+def _summary(results: Results) -> PageSection:
     table, rows = _summary_table(results)
     met = [sum(bool(pair[k][1]) for pair in ((row[2], row[3]) for row in rows)) for k in (0, 1)]
     tiles = [
         Tile(f"{met[1]} of {len(rows)}", "figures of the paper met or beaten by lumidock", _good(met[1] == len(rows))),
         Tile(f"{met[0]} of {len(rows)}", "met by the paper's method here", _good(met[0] == len(rows))),
     ]
-    return Section("The paper's figures", tiles=tiles, items=[table])
+    return PageSection("The paper's figures", tiles=tiles, items=[table])
 
 
 def _with_verdict(cell: tuple[str, bool]) -> str:
@@ -254,8 +254,9 @@ def _search(results: Results, out: Path) -> list[Any]:
         theirs = sides["paper"][side]
         rows.append([side, str(all_of["frames"]), str(theirs["valid"]), str(all_of["used"]), str(all_of["valid"])])
     for method in ("paper", "lumidock"):
-        labels = result[method]["labels"]
-        rows.append([f"wrong names, {method}", f"{labels['wrong']} of {labels['named']}", "", "", ""])
+        identities = result[method]["identities"]
+        cell = f"{identities['wrong']} of {identities['identified']}"
+        rows.append([f"wrong identities, {method}", cell, "", "", ""])
     head = ["dock seen from", "frames", "paper's method: pose", "lumidock: bearing and range", "lumidock: pose"]
     table = Table("Frames by side of the rectangle.", head, rows)
     views = [load_run(folder / method, folder / "sequence") for method in ("lumidock", "paper")]
@@ -267,7 +268,7 @@ def _docking(results: Results, out: Path) -> list[Any]:
     views = [load_run(folder / method, folder / "sequence") for method in ("lumidock", "paper")]
     rows = [[name, *(cell(result[method]) for method in ("paper", "lumidock"))] for name, cell in _DOCKING_ROWS.items()]
     table = Table("The docking by both methods.", ["", "paper's method", "lumidock"], rows)
-    shown = pictures(views[0], _SHOWN_PICTURES)
+    shown = annotated_images(views[0], _SHOWN_PICTURES)
     return [
         *shown,
         table,
@@ -286,7 +287,7 @@ _DOCKING_ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "axial error, m": lambda r: _error(r, "axial_m"),
     "angle error, deg": lambda r: _error(r, "angle_deg"),
     "hazardously misleading frames": lambda r: str(r["hazardous"]["valid"]["any"] + r["hazardous"]["guide"]["any"]),
-    "wrong names": lambda r: f"{r['labels']['wrong']} of {r['labels']['named']}",
+    "wrong identities": lambda r: f"{r['identities']['wrong']} of {r['identities']['identified']}",
     f"ms a frame, single / dual layer (budget {FRAME_MS:g})": lambda r: _times(r["ms"]),
 }
 

@@ -13,7 +13,7 @@ from lumidock.datatypes import Fix, Frame, Unusable
 from lumidock.errors import InputError, extra
 from lumidock.station import load_station
 from lumidock.streams.replay import read_fixes
-from lumidock.streams.sinks import FILE_KINDS, Scene, open_file_sink
+from lumidock.streams.sinks import FILE_KINDS, Setting, open_file_sink
 from lumidock.streams.sources import Item, Source
 from lumidock.streams.vehicle import Vehicle
 
@@ -55,18 +55,18 @@ def _write(
         with extra("parquet"):
             from lumidock.streams.parquet import write_parquet
         return write_parquet(run, path)
-    scene, done = Scene(load_station(run / "station.yaml"), load_camera(run / "camera.yaml"), vehicle), 0
-    with closing(open_file_sink(path, scene)) as sink:
-        for item, fix, latency_us in _frames(run, scene, source):
+    setting, done = Setting(load_station(run / "station.yaml"), load_camera(run / "camera.yaml"), vehicle), 0
+    with closing(open_file_sink(path, setting)) as sink:
+        for item, fix, latency_us in _frames(run, setting, source):
             sink.add(item, fix, latency_us)
             done += 1
             progress(done, source.count if source else None)
     return done
 
 
-def _frames(run: Path, scene: Scene, source: Source | None) -> Iterator[tuple[Item, Fix, int | None]]:
+def _frames(run: Path, setting: Setting, source: Source | None) -> Iterator[tuple[Item, Fix, int | None]]:
     """Each frame of the source with its fix; without a source the frame is only its name and stamp."""
-    rows = read_fixes(run, scene.station.ids)
+    rows = read_fixes(run, setting.station.ids)
     if source is None:
         for fix, t_ns, latency_us in rows:
             yield Unusable(fix.frame, t_ns, "", ""), fix, latency_us

@@ -10,10 +10,9 @@ import rerun as rr
 from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
 from lumidock.station import Station
+from lumidock.streams.colors import of_layer, rgb
 from lumidock.streams.jpeg import jpeg_of
 
-_LAYER_COLORS = ((255, 220, 80), (60, 190, 255), (120, 255, 120))
-_SPURIOUS = (255, 60, 60)
 _FIRST_EPOCH_NS = 10**18  # stamps from 2001 on are dates, smaller ones count from the start of something
 
 
@@ -28,7 +27,7 @@ class RerunLog:
         else:
             self._stream.save(Path(target))
         self._station = station
-        colors = [_LAYER_COLORS[int(layer) % len(_LAYER_COLORS)] for layer in station.layer]
+        colors = [rgb(of_layer(station, light)) for light in range(len(station))]
         self._stream.log("dock", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
         lights = rr.Points3D(station.p_dock, colors=colors, labels=list(station.ids), radii=0.05)
         self._stream.log("dock/lights", lights, static=True)
@@ -63,7 +62,7 @@ class RerunLog:
             self._stream.log("dock/camera/image/lights", rr.Clear(recursive=False))
             return
         named = [int(light) for light in detections.light]
-        colors = [_SPURIOUS if i < 0 else _LAYER_COLORS[int(self._station.layer[i]) % 3] for i in named]
+        colors = [rgb(of_layer(self._station, int(light))) for light in named]
         labels = ["" if i < 0 else self._station.ids[i] for i in named]
         points = rr.Points2D(detections.detections.uv + 0.5, colors=colors, labels=labels, radii=4.0)
         self._stream.log("dock/camera/image/lights", points)

@@ -7,8 +7,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-
 from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Image, Unusable
 from lumidock.errors import InputError, extra
@@ -35,34 +33,32 @@ class Sink(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
-    """What every sink needs to know beside the fixes."""
+class Setting:
+    """What every sink needs beside the fixes: the dock, the camera and how it is mounted on the vehicle."""
 
     station: Station
     camera: Camera
     vehicle: Vehicle | None = None
 
 
-def open_file_sink(path: Path, scene: Scene) -> Sink:
+def open_file_sink(path: Path, setting: Setting) -> Sink:
     """A sink that writes `path`, whose ending says what it becomes. Raises: InputError for another ending."""
     if path.suffix == ".mcap":
         with extra("bag"):
             from lumidock.streams.mcapfile import McapFile
-        return McapFile(path, scene.camera, scene.vehicle, scene.station.ids)
+        return McapFile(path, setting.camera, setting.vehicle, setting.station.ids)
     if path.suffix == ".rrd":
-        return open_rerun(str(path), scene)
+        return open_rerun(str(path), setting)
     if path.suffix == ".mp4":
-        with extra("video"):
-            from lumidock.streams.mp4 import Mp4
-        return _AnnotatedVideo(Mp4(path), scene)
+        return _AnnotatedVideo(open_video(path), setting)
     raise InputError(f"{path}: not one of {', '.join(FILE_KINDS)}")
 
 
-def open_rerun(target: str, scene: Scene) -> Sink:
+def open_rerun(target: str, setting: Setting) -> Sink:
     """A Rerun file, or the viewer at rerun+http://HOST:PORT/proxy."""
     with extra("rerun"):
         from lumidock.streams.rerunlog import RerunLog
-    return RerunLog(target, scene.station, scene.camera)
+    return RerunLog(target, setting.station, setting.camera)
 
 
 class RunSink:
@@ -83,39 +79,52 @@ class RunSink:
 class Numbered:
     """Opens FILE, and after a failure FILE-1, FILE-2, ..., so that what was written stays."""
 
-    def __init__(self, path: Path, scene: Scene) -> None:
-        self._path, self._scene, self._number, self._opened = path, scene, 0, False
+    def __init__(self, path: Path, setting: Setting) -> None:
+        self._path, self._setting, self._number, self._opened = path, setting, 0, False
 
     def open(self) -> Sink:
         """A sink of the first file that was not written to before."""
         current = self._current()
         self._number += self._opened and current.exists() and current.stat().st_size > 0
         self._opened = True
-        return open_file_sink(self._current(), self._scene)
+        return open_file_sink(self._current(), self._setting)
 
     def _current(self) -> Path:
         return self._path.with_stem(f"{self._path.stem}-{self._number}") if self._number else self._path
 
 
-class _Pictures(Protocol):
-    def add(self, picture: Image, t_ns: int) -> None: ...
+class ImageSink(Protocol):
+    """Takes one image after the other, as a video file does."""
 
-    def close(self) -> None: ...
+    def add(self, picture: Image, t_ns: int) -> None:
+        """Append an image (H, W, 3) bgr8 of time `t_ns`."""
+        ...
+
+    def close(self) -> None:
+        """Write what is left."""
+        ...
+
+
+def open_video(path: Path) -> ImageSink:
+    """An H.264 video that browsers play. Raises: InputError when PyAV is not installed (extra `video`)."""
+    with extra("video"):
+        from lumidock.streams.mp4 import Mp4
+    return Mp4(path)
 
 
 @dataclass(frozen=True, slots=True)
 class _AnnotatedVideo:
-    video: _Pictures
-    scene: Scene
+    video: ImageSink
+    setting: Setting
 
     def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
         """Draw one fix; frames without a picture leave the last one standing."""
         del latency_us
         if isinstance(item, Frame):
             image = developed(item)
-            view = whole(image, min(_WIDTH, image.shape[1]))
-            picture = draw(image, fix, self.scene.station, self.scene.camera, view)
-            self.video.add(np.asarray(picture, np.uint8), item.t_ns)
+            crop = whole(image, min(_WIDTH, image.shape[1]))
+            picture = draw(image, fix, self.setting.station, self.setting.camera, crop)
+            self.video.add(picture, item.t_ns)
 
     def close(self) -> None:
         self.video.close()

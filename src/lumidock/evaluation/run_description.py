@@ -1,0 +1,46 @@
+"""The run.json of a run folder: what the run was made with and from, and its counts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lumidock.errors import InputError
+
+_MAPPINGS = ("source", "inputs_sha256", "inputs_sampled", "config", "counts")
+
+
+def read_description(folder: Path) -> dict[str, Any]:
+    """The content of run.json. Raises: InputError, one line, for a folder without one or one that is damaged."""
+    path = folder / "run.json"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+    if not isinstance(content, dict) or not all(isinstance(content.get(part, {}), dict) for part in _MAPPINGS):
+        raise InputError(f"{path}: not the description of a run")
+    return content
+
+
+def description_if_any(folder: Path) -> dict[str, Any]:
+    """The same, but empty where another program wrote the run folder and left no readable run.json."""
+    try:
+        return read_description(folder)
+    except InputError:
+        return {}
+
+
+def source_kind(description: Mapping[str, Any]) -> str:
+    """What the frames came from: `sequence`, `detections`, `bag`, ...; empty where that is not known."""
+    return str(description.get("source", {}).get("kind", ""))
+
+
+def mean_nis(description: Mapping[str, Any]) -> dict[str, float] | None:
+    """Mean normalised innovation squared per degree of freedom over the tracked frames, as the run summed it up."""
+    try:
+        nis = description["counts"]["nis"]
+        return None if nis is None else {"frames": int(nis["frames"]), "mean": float(nis["mean"])}
+    except (KeyError, TypeError, ValueError):
+        return None
