@@ -28,7 +28,7 @@ from lumidock.cli.shared import (
 )
 from lumidock.config import Config, load_config
 from lumidock.datatypes import Detections
-from lumidock.errors import InputError, extra
+from lumidock.errors import InputError
 from lumidock.station import Station, load_station
 
 if TYPE_CHECKING:
@@ -104,15 +104,15 @@ def _survey(
     with progress_bar("survey") as progress:
         lens, recordings = _recordings(sources, drawing, camera, (settings, fps))
         found = survey(recordings, drawing, lens, settings, prior, progress=progress)
+    if out is not None and not found.refusal:
+        _write(found, path, out)
     if page is not None:
         _write_page(found, lens, page)
-    if check:
-        _report_moves(found, drawing, as_json)
-        return
-    assert out is not None
     if found.refusal:
         raise InputError(f"survey refused: {found.refusal}")
-    _write(found, path, out)
+    if out is None:
+        _report_moves(found, drawing, as_json)
+        return
     print(json.dumps(_summary(found), indent=1) if as_json else _told(found, out))
 
 
@@ -237,8 +237,6 @@ def _write_page(found: Survey, lens: Camera, target: Path) -> None:
     from lumidock.setup import bundle
     from lumidock.setup.advice import helpful_views
 
-    with extra("report"):
-        import jinja2  # noqa: F401  # a missing extra is told before the work
     at, observed = found.adjusted.estimate, found.observed
     drawn, _ = bundle.refine_poses(observed, lens, found.before.p_dock, at.T_dock_cam, observed.sigma_px)
     view = SurveyView(

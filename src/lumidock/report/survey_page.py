@@ -10,7 +10,7 @@ import numpy as np
 
 from lumidock.datatypes import Array, Indices
 from lumidock.report import page
-from lumidock.report.page import Plot, Section, Table, Tile
+from lumidock.report.page import Plot, PageSection, Table, Tile
 from lumidock.report.plots import COLORS, plot
 from lumidock.station import Station
 
@@ -54,11 +54,11 @@ def survey_page(view: SurveyView) -> str:
         " were seen fit the drawing best, so the docking point keeps its place among them."
     )
     sections = [
-        Section("Result", text=view.refusal and f"Refused: {view.refusal}.", tiles=_tiles(view), items=[_dock(view)]),
-        Section("Each light", items=[_lights(view)]),
-        Section("Residuals", text=_RESIDUALS, items=[_residuals(view)]),
-        Section("What the footage leaves open", items=[_listed("Not observed", view.unobserved)]),
-        Section("What to film next", text=_NEXT, items=[_listed("Views", view.views)]),
+        PageSection("Result", text=view.refusal and f"Refused: {view.refusal}.", tiles=_tiles(view), items=[_dock(view)]),
+        PageSection("Each light", items=[_lights(view)]),
+        PageSection("Residuals", text=_RESIDUALS, items=[_residuals(view)]),
+        PageSection("What the footage leaves open", items=[_listed("Not observed", view.unobserved)]),
+        PageSection("What to film next", text=_NEXT, items=[_listed("Views", view.views)]),
     ]
     return page.render(f"Survey of {view.after.name}", lead, sections)
 

@@ -11,7 +11,7 @@ from lumidock.datatypes import Array
 from lumidock.geometry import so3_exp
 from lumidock.setup import bundle
 from lumidock.setup.bundle import CALIBRATION, Estimate
-from lumidock.setup.gauge import rigid_free
+from lumidock.setup.gauge import shape_covariance
 from lumidock.setup.observations import Observations
 from lumidock.setup.survey import Survey
 
@@ -47,7 +47,7 @@ def helpful_views(found: Survey, camera: Camera, most: int = 3) -> list[View]:
                 T_dock_cam = _looking(p_dock, range_m, right, above)
                 gained, lights = _gained(found, camera, T_dock_cam, noise)
                 if lights >= 4:
-                    after = np.trace(rigid_free(np.linalg.inv(information + gained), p_dock, seen))
+                    after = np.trace(shape_covariance(np.linalg.inv(information + gained), p_dock, seen))
                     views.append(View(range_m, right, above, lights, float(np.sqrt(after / now))))
     return sorted(views, key=lambda view: view.share)[:most]
 

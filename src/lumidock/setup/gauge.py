@@ -18,11 +18,22 @@ def similarity_generators(p_dock: Array) -> Array:
     return G.reshape(-1, 7)
 
 
-def rigid_free(covariance: Array, p_dock: Array, seen: np.ndarray) -> Array:
-    """Covariance (3M, 3M) of the shape: of positions after the best rigid fit of the lights `seen` (M,) to the true."""
-    G, n = similarity_generators(p_dock)[:, :6], p_dock.size
-    E = np.eye(n) - G @ np.linalg.pinv(G * np.repeat(seen, 3)[:, None])
+def shape_covariance(covariance: Array, p_dock: Array, seen: np.ndarray) -> Array:
+    """Covariance (3M, 3M) of the shape: of positions after the best similarity fit of the lights `seen` (M,)."""
+    n = p_dock.size
+    E = np.eye(n) - similarity_generators(p_dock) @ _fit(p_dock, seen)
     return np.asarray(E @ covariance[:n, :n] @ E.T)
+
+
+def scale_sigma(covariance: Array, p_dock: Array, seen: np.ndarray) -> float:
+    """Relative 1-sigma error of the size of the array of the lights `seen` (M,)."""
+    size = _fit(p_dock, seen)[6]
+    return float(np.sqrt(size @ covariance[: p_dock.size, : p_dock.size] @ size))
+
+
+def _fit(p_dock: Array, seen: np.ndarray) -> Array:
+    """The similarity (7, 3M) that small moves of the lights amount to, by the lights `seen` (M,)."""
+    return np.linalg.pinv(similarity_generators(p_dock) * np.repeat(seen, 3)[:, None])
 
 
 def aligned(p: Array, target: Array, *, scale: bool = False) -> Array:

@@ -19,7 +19,7 @@ from lumidock.errors import InputError
 from lumidock.pose import sqpnp
 from lumidock.setup import bundle
 from lumidock.setup.bundle import CALIBRATION, Adjusted, Distance, Estimate, Prior
-from lumidock.setup.gauge import rigid_free, similarity_generators
+from lumidock.setup.gauge import scale_sigma, shape_covariance
 from lumidock.setup.observations import LEAST_LIGHTS, Observations, Progress, identify
 from lumidock.station import Station
 
@@ -40,9 +40,10 @@ _MOST_MOVED = 4.0  # rms move in sigmas of the drawing beyond which its sigmas a
 class Survey:
     """What a survey found.
 
-    `after` is the drawing with the new positions; `sigma_m` (M, 3) the 1-sigma error of each in the dock's axes, the
-    dock's frame taken as the one in which the lights fit the drawing best; `scale_sigma` the relative error of the
-    size of the whole. `held_out_px` are the rms residuals of frames that had no part in the adjustment: with the
+    `after` is the drawing with the new positions; `sigma_m` (M, 3) the 1-sigma error of each in the dock's axes and
+    `covariance` (3M, 3M) of all, the dock's frame taken as the one in which the lights that were seen fit the true
+    ones best. `scale_sigma` is the relative error of the size of the whole, which is not in `sigma_m`: it acts as an
+    error of the focal length does, and `after` counts it there. `held_out_px` are the rms residuals of frames that had no part in the adjustment: with the
     drawing, and with the positions from the other frames. `unobserved` says in words what the footage left open.
     `refusal` is empty where the result may be used.
     """
@@ -83,7 +84,7 @@ def survey(
         adjusted = bundle.adjust(observed, camera, prior, Estimate(station.p_dock, poses, calibration))
         moved = np.abs(adjusted.estimate.p_dock - station.p_dock)
         estimate = adjusted.estimate
-        covariance = rigid_free(adjusted.covariance, estimate.p_dock, adjusted.used.any(axis=0))
+        covariance = shape_covariance(adjusted.covariance, estimate.p_dock, adjusted.used.any(axis=0))
         station = replace(station, p_dock=estimate.p_dock)
         sigma = np.maximum(np.sqrt(np.diagonal(covariance)).reshape(-1, 3), _LEAST_SIGMA_M)
         if (moved < _SETTLED * sigma + 1e-4).all():
@@ -206,9 +207,11 @@ def _conclude(
     drawing: Station, camera: Camera, prior: Prior, observed: Observations, adjusted: Adjusted, rounds: int
 ) -> Survey:
     estimate = adjusted.estimate
-    covariance = rigid_free(adjusted.covariance, estimate.p_dock, adjusted.used.any(axis=0))
+    covariance = shape_covariance(adjusted.covariance, estimate.p_dock, adjusted.used.any(axis=0))
     sigma = np.maximum(np.sqrt(np.diagonal(covariance)).reshape(-1, 3), _LEAST_SIGMA_M)
-    scale, scale_before = _scale_sigmas(covariance, prior, estimate.p_dock)
+    seen = adjusted.used.any(axis=0)
+    scale = scale_sigma(adjusted.covariance, estimate.p_dock, seen)
+    scale_before = scale_sigma(np.diag(prior.sigma_m.ravel() ** 2), prior.p_dock, seen)
     held_out = _held_out(observed, camera, prior, adjusted)
     return Survey(
         before=drawing,
@@ -223,13 +226,6 @@ def _conclude(
         refusal=_refusal(prior, adjusted, held_out, observed),
         rounds=rounds,
     )
-
-
-def _scale_sigmas(covariance: Array, prior: Prior, p_dock: Array) -> tuple[float, float]:
-    """Relative 1-sigma error of the dock's size, after and before."""
-    g = similarity_generators(p_dock)[:, 6]
-    before = (g**2 * prior.sigma_m.ravel() ** 2).sum()
-    return float(np.sqrt(g @ covariance @ g)) / float(g @ g), float(np.sqrt(before)) / float(g @ g)
 
 
 def _held_out(observed: Observations, camera: Camera, prior: Prior, adjusted: Adjusted) -> tuple[float, float]:
