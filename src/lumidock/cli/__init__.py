@@ -18,6 +18,7 @@ from lumidock.camera import load_camera, save_camera
 from lumidock.cli import (
     calibration,
     demo,
+    designing,
     doctoring,
     evaluation,
     exporting,
@@ -77,6 +78,7 @@ _COMMANDS = (
     calibration,
     stations,
     setting_up,
+    designing,
     demo,
     doctoring,
 )  # importing them adds their commands
