@@ -20,7 +20,7 @@ from lumidock.evaluation.cramer_rao import Bound
 from lumidock.evaluation.station_check import head_on, in_view
 from lumidock.station import Station
 
-_FRAME_RATE_HZ, _STEP_HZ = 15.0, 2.0  # of the camera; of the bound, whose noise is that of the frames it stands for
+_FRAME_RATE_HZ = 15.0  # of the camera; the bound takes fewer steps, each with the noise of the frames it stands for
 _RUN_IN_M = 4.0
 NO_LEVEL = 20.0  # the ratio where there is no level at all, and the most that one counts
 _APPARENT_FROM_M = 18.0  # where lights of one layer are compared as they appear
@@ -28,17 +28,21 @@ _APPARENT_FROM_M = 18.0  # where lights of one layer are compared as they appear
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """A head-on approach from `from_z_m` to `to_z_m` at `speed_m_s`, in water that shows light i to `reach_m` (M,)."""
+    """A head-on approach from `from_z_m` to `to_z_m` at `speed_m_s`, in water that shows light i to `reach_m` (M,).
+
+    The bound takes `step_hz` steps a second.
+    """
 
     from_z_m: float
     to_z_m: float
     speed_m_s: float
     reach_m: Array
+    step_hz: float = 2.0
 
     def z_m(self) -> Array:
         """Where the bound is taken (K,), from afar to near; it begins before what is judged, as a docking does."""
-        steps = round((self.from_z_m + _RUN_IN_M - self.to_z_m) / self.speed_m_s * _STEP_HZ)
-        return np.asarray(self.from_z_m + _RUN_IN_M - np.arange(steps + 1) * self.speed_m_s / _STEP_HZ)
+        steps = round((self.from_z_m + _RUN_IN_M - self.to_z_m) / self.speed_m_s * self.step_hz)
+        return np.asarray(self.from_z_m + _RUN_IN_M - np.arange(steps + 1) * self.speed_m_s / self.step_hz)
 
 
 def seen_along(station: Station, camera: Camera, approach: Approach) -> np.ndarray:
@@ -59,11 +63,11 @@ def level_ratios(
 
     `NO_LEVEL` where the bound gives none, and 0 before the part of the approach that is judged.
     """
-    noise = config.match.noise_px * (_STEP_HZ / _FRAME_RATE_HZ) ** 0.5
+    noise = config.match.noise_px * (approach.step_hz / _FRAME_RATE_HZ) ** 0.5
     slower = config.model_copy(update={"match": config.match.model_copy(update={"noise_px": noise})})
     bound, out = Bound(station, camera, slower), np.full(len(seen), NO_LEVEL)
     for k, z in enumerate(approach.z_m()):
-        level = bound.step(round(k * 1e9 / _STEP_HZ), head_on(float(z)), np.flatnonzero(seen[k]).astype(np.int64))
+        level = bound.step(round(k * 1e9 / approach.step_hz), head_on(float(z)), np.flatnonzero(seen[k]).astype(np.int64))
         if z > approach.from_z_m + 1e-9:
             out[k] = 0.0
         elif level is not None and np.isfinite(level).all():

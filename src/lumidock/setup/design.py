@@ -7,7 +7,7 @@ structure offers. The worst case: the largest protection level over its alert li
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,7 +30,8 @@ from lumidock.station import Color, Name, Station, Vector, load_station
 from lumidock.setup.station_files import write_station_file
 from lumidock.yamlfile import read_mapping, validate
 
-_WORST_SETS, _NEW_SETS = 4, 3  # of dead lights in one evaluation: those that were worst lately, and others by chance
+_WORST_SETS, _NEW_SETS = 3, 1  # of dead lights in one evaluation: those that were worst lately, and others by chance
+_SEARCH_HZ = 1.0  # steps of the bound in the search; the layout that is found is judged at twice that
 _FORGET = 0.9  # how much of a set's last ratio counts when it was not tried again
 _FIRST_SPREAD = 0.25  # of a rail's length
 _SPACING_WEIGHT, _CONFUSION_WEIGHT = 20.0, 20.0  # cost per m that is missing; a ratio of 2 costs 0.3
@@ -195,7 +196,7 @@ class _Judge:
             station = self.station(u)
         except InputError:  # two lights at one place, or all on one spot
             return 10.0
-        approach = approach_of(self.spec, station)
+        approach = replace(approach_of(self.spec, station), step_hz=_SEARCH_HZ)
         seen = seen_along(station, self.camera, approach)
         self._bad *= _FORGET
         ratios = []

@@ -23,7 +23,8 @@ class Observations:
     """Identified lights in F frames; M lights.
 
     `uv` (F, M, 2) px, NaN where a light was not detected; `sigma_px` (F, M) the 1-sigma error of each centre as the
-    detector states it, or as configured where it states none; `recording` (F,) and `t_ns` (F,) say when; `frame` (F,) are the names of the frames.
+    detector states it, or as configured where it states none; `recording` (F,), `t_ns` (F,) and `frame` (F,) say when.
+    `share` is the part of the frames between the first and the last identified one of a recording that were identified.
     """
 
     uv: Array
@@ -31,6 +32,7 @@ class Observations:
     recording: Indices
     t_ns: Indices
     frame: tuple[str, ...]
+    share: float = 1.0
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -48,12 +50,13 @@ class Observations:
             self.recording[frames],
             self.t_ns[frames],
             tuple(self.frame[i] for i in frames),
+            self.share,
         )
 
     def without(self, rejected: np.ndarray) -> Self:
         """The same without the detections where `rejected` (F, M)."""
         uv = np.where(rejected[..., None], np.nan, self.uv)
-        return type(self)(uv, self.sigma_px, self.recording, self.t_ns, self.frame)
+        return type(self)(uv, self.sigma_px, self.recording, self.t_ns, self.frame, self.share)
 
 
 def identify(
@@ -68,14 +71,17 @@ def identify(
     The station's declared sigmas decide how far a light may lie from where the file has it. Frames in which fewer than
     four lights are identified are left out.
     """
-    rows, done = [], 0
+    rows: list[_Row | None] = []
+    done = spans = 0
     for number, recording in enumerate(recordings):
-        localizer = Localizer(station, camera, config)
+        localizer, first = Localizer(station, camera, config), len(rows)
         for detections in recording:
             rows.append(_row(number, localizer.process_detections(detections), len(station), config.match.noise_px))
             done += 1
             if progress is not None:
                 progress(done, None)
+        found = [k for k, row in enumerate(rows[first:]) if row is not None]
+        spans += found[-1] - found[0] + 1 if found else 0
     kept = [row for row in rows if row is not None]
     if not kept:
         m = len(station)
@@ -86,6 +92,7 @@ def identify(
         np.array([row.recording for row in kept], np.int64),
         np.array([row.t_ns for row in kept], np.int64),
         tuple(row.frame for row in kept),
+        len(kept) / spans,
     )
 
 

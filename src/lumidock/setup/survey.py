@@ -26,6 +26,7 @@ from lumidock.station import Station
 _ROUNDS = 5  # of association and adjustment; a drawing 10 cm off settles in three
 _MOST_FRAMES = 150  # of one recording; more lengthen a survey and add little, as the camera's errors are shared
 _LEAST_FRAMES = 12  # six unknowns a frame: fewer frames leave the lights little more than the drawing says
+_LEAST_SHARE = 0.5  # of the frames; a drawing 10 cm off, stated as such, is followed in nine of ten
 _LEAST_SEEN = 10  # frames; a light identified in fewer may be another lamp or a glint, and stays as drawn
 _MOST_TILT_RAD = 0.02  # 1 sigma of a frame's tilt; beyond, its flip fits as well and pulls the lights out of plane
 _DECIDED = 9.0  # cost by which the flip of a plane must fit worse: 3 sigmas
@@ -126,6 +127,11 @@ def _usable(
     observed: Observations, camera: Camera, p_dock: Array, sigma_m: Array
 ) -> tuple[Observations, Array]:
     """The frames whose pose is clear, thinned, with these poses (F, 4, 4). Raises: InputError where they are too few."""
+    if observed.share < _LEAST_SHARE:
+        raise InputError(
+            f"lights were identified in only {100 * observed.share:.0f} % of the frames that show them: this is another"
+            " dock, or the drawing is further off than stated; state how far off it may be with --off"
+        )
     frames = [
         bundle.thinned(np.flatnonzero(observed.recording == number), 2 * _MOST_FRAMES)
         for number in np.unique(observed.recording)
