@@ -27,6 +27,7 @@ from lumidock.cli import (
     serving,
     setting_up,
     stations,
+    water,
 )
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
@@ -76,6 +77,7 @@ _COMMANDS = (
     reporting,
     serving,
     calibration,
+    water,
     stations,
     setting_up,
     designing,
