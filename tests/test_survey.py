@@ -210,8 +210,12 @@ def test_footage_of_another_dock_is_refused(dock: BuiltDock):
     rng = np.random.default_rng(0)
     other = replace(dock.drawing, p_dock=dock.drawing.p_dock + rng.normal(size=(13, 3)) * [0.5, 0.5, 0.2])
     few = [dock.recordings[0][60:100]]
-    with pytest.raises(InputError, match="another dock|frames with four or more identified lights"):
-        survey(few, other, dock.camera, Config(), prior_of(other))
+    assert "another dock" in survey(few, other, dock.camera, Config(), prior_of(other)).refusal
+
+
+def test_footage_that_shows_hardly_any_light_is_refused(dock: BuiltDock):
+    with pytest.raises(InputError, match="frames with four or more identified lights"):
+        survey([dock.recordings[0][:3]], dock.drawing, dock.camera, Config(), prior_of(dock.drawing))
 
 
 def test_advice_is_a_view_that_shows_lights_and_helps(dock: BuiltDock, found: Survey):

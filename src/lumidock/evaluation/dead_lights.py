@@ -85,7 +85,7 @@ def dead_sets(lights: int, most: int) -> list[tuple[int, ...]]:
 class Strength:
     """The worst ratio at each place (K,) over all sets of dead lights, and which set (K,) of `dead` makes it.
 
-    `alone` (M,) is the worst ratio of the whole approach with that light dead alone, or with one more.
+    `alone` (M,) is the worst ratio of the whole approach over the sets that hold light i.
     """
 
     z_m: Array

@@ -27,6 +27,7 @@ _ROUNDS = 5  # of association and adjustment; a drawing 10 cm off settles in thr
 _MOST_FRAMES = 150  # of one recording; more lengthen a survey and add little, as the camera's errors are shared
 _LEAST_FRAMES = 12  # six unknowns a frame: fewer frames leave the lights little more than the drawing says
 _LEAST_SHARE = 0.5  # of the frames; a drawing 10 cm off, stated as such, is followed in nine of ten
+_LEAST_LIT = 0.6  # of the lights; five lights of another dock can pass for five of this one
 _LEAST_SEEN = 10  # frames; a light identified in fewer may be another lamp or a glint, and stays as drawn
 _MOST_TILT_RAD = 0.02  # 1 sigma of a frame's tilt; beyond, its flip fits as well and pulls the lights out of plane
 _DECIDED = 9.0  # cost by which the flip of a plane must fit worse: 3 sigmas
@@ -291,6 +292,9 @@ def _refusal(prior: Prior, adjusted: Adjusted, held_out_px: tuple[float, float],
     agree = adjusted.used.sum() / max(observed.seen.sum(), 1)
     if agree < 0.8:
         return f"only {100 * agree:.0f} % of the identified detections agree with the result"
+    seen = adjusted.used.any(axis=0)
+    if seen.mean() < _LEAST_LIT:
+        return f"only {seen.sum()} of {len(seen)} lights were identified: this is another dock, or most of it is dark"
     moved = (adjusted.estimate.p_dock - prior.p_dock) / prior.sigma_m
     rms = float(np.sqrt((moved**2).mean()))
     if rms > _MOST_MOVED:
