@@ -22,6 +22,7 @@ class BuiltDock:
     built: Station
     camera: Camera
     recordings: list[list[Detections]]
+    lights: list[list[Array]]  # of each detection, -1 for a spurious one
 
 
 def built_dock(
@@ -37,11 +38,14 @@ def built_dock(
     as_it_is = Camera(camera.width, camera.height, K)
     own = ("detections.survey=0", "detections.calibration=0", f"path.frame_interval_s={interval_s}")
     scenario = load_scenario("nominal", (*own, *settings))
-    recordings = [
-        [frame.detections for frame in simulated_frames(scenario, built, as_it_is, 1000 * seed + k)]
-        for k in range(dockings)
-    ]
-    return BuiltDock(replace(drawing, sigma_light_m=off_m, sigma_layer_m=0.0), built, camera, recordings)
+    frames = [list(simulated_frames(scenario, built, as_it_is, 1000 * seed + k)) for k in range(dockings)]
+    return BuiltDock(
+        replace(drawing, sigma_light_m=off_m, sigma_layer_m=0.0),
+        built,
+        camera,
+        [[frame.detections for frame in recording] for recording in frames],
+        [[frame.light for frame in recording] for recording in frames],
+    )
 
 
 def taped(dock: BuiltDock, a: str, b: str) -> tuple[int, int, float]:

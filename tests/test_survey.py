@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from docks import BuiltDock, built_dock, shape_error, taped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,7 +26,6 @@ from lumidock.setup.observations import Observations
 from lumidock.setup.station_files import write_surveyed
 from lumidock.setup.survey import Survey, prior_of, survey
 from lumidock.station import load_station
-from tests.docks import BuiltDock, built_dock, shape_error, taped
 
 REAL = Path(__file__).parents[2] / "shared" / "real"
 
@@ -48,11 +48,20 @@ def found(dock: BuiltDock) -> Survey:
 
 def _scene(seed: int, frames: int = 6, noise_px: float = 0.0) -> tuple[Camera, Array, Array, Observations]:
     rng = np.random.default_rng(seed)
-    camera = Camera(1000, 800, np.array([[700.0, 0, 500], [0, 710.0, 400], [0, 0, 1]]), "plumb_bob",
-                    np.array([-0.1, 0.02, 1e-3, -5e-4, 0.0]))
+    camera = Camera(
+        1000,
+        800,
+        np.array([[700.0, 0, 500], [0, 710.0, 400], [0, 0, 1]]),
+        "plumb_bob",
+        np.array([-0.1, 0.02, 1e-3, -5e-4, 0.0]),
+    )
     p_dock = rng.uniform(-1.0, 1.0, (8, 3)) * [1.0, 1.0, 0.8]
-    T = np.array([np.diag([1.0, -1, -1, 1]) @ se3_exp(rng.normal(size=6) * [0.5, 0.5, 0.5, 0.1, 0.1, 0.1])
-                  for _ in range(frames)])
+    T = np.array(
+        [
+            np.diag([1.0, -1, -1, 1]) @ se3_exp(rng.normal(size=6) * [0.5, 0.5, 0.5, 0.1, 0.1, 0.1])
+            for _ in range(frames)
+        ]
+    )
     T[:, :3, 3] += [0.0, 0.0, 4.0]
     p_cam = (p_dock[None] - T[:, None, :3, 3]) @ T[:, :3, :3]
     uv = camera.project(p_cam.reshape(-1, 3)).reshape(frames, 8, 2) + rng.normal(size=(frames, 8, 2)) * noise_px
@@ -164,23 +173,19 @@ def test_without_a_distance_the_survey_says_that_the_size_is_unknown(dock: Built
     assert any("size" in text for text in _surveyed(dock, tape=False).unobserved)
 
 
-def test_a_light_that_is_never_seen_stays_as_drawn():
-    dock = built_dock(4, settings=("faults.spurious=[0,0]", "detections.clutter=0", "detections.dead=[0,0]"))
+def test_a_light_that_is_never_seen_stays_as_drawn(dock: BuiltDock):
     dark = dock.drawing.ids.index("F2")
-    alone = [
-        [_without(d, dock, dark, frame) for frame, d in enumerate(recording)] for recording in dock.recordings
+    without = [
+        [_only(d, light != dark) for d, light in zip(*pair, strict=True)]
+        for pair in zip(dock.recordings, dock.lights, strict=True)
     ]
-    got = _surveyed(replace(dock, recordings=alone))
+    got = _surveyed(replace(dock, recordings=without))
     assert any("F2" in text for text in got.unobserved)
     assert np.sqrt((got.sigma_m[dark] ** 2).mean()) > 0.04
     assert np.abs(got.after.p_dock[dark] - dock.drawing.p_dock[dark]).max() < 0.05
 
 
-def _without(d: Detections, dock: BuiltDock, light: int, frame: int) -> Detections:
-    """The frame without the detection of one light: the simulator lists lights in their order where none is missing."""
-    keep = np.ones(len(d), bool)
-    if len(d) > light:
-        keep[light] = False
+def _only(d: Detections, keep: np.ndarray) -> Detections:
     return Detections(d.frame, d.t_ns, *(getattr(d, f)[keep] for f in ("uv", "radius_px", "flux", "p_light", "p_rear")))
 
 

@@ -138,8 +138,11 @@ def test_too_few_views_and_absurd_boards_are_refused():
 
 def test_advice_names_the_corner_of_the_picture_that_no_board_was_in():
     views, _ = _views(LENS["plumb_bob"], np.random.default_rng(8), 20, 0.1)
-    low = [Sighting(one.frame, one.corner[keep], one.uv[keep]) for one in views
-           if (keep := one.uv[:, 1] > 500.0).sum() >= 8]
+    low = [
+        Sighting(one.frame, one.corner[keep], one.uv[keep])
+        for one in views
+        if (keep := one.uv[:, 1] > 500.0).sum() >= 8
+    ]
     got = calibrate(BOARD, low, SIZE)
     assert any("top left" in text for text in got.advice)
     assert not any("bottom" in text for text in got.advice)

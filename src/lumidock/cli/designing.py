@@ -56,8 +56,8 @@ def _design(
     worst = int(judged.ratio.argmax())
     dead = [found.station.ids[i] for i in judged.dead[int(judged.worst[worst])]]
     told = (
-        f"worst level over limit {judged.ratio[worst]:.2f} at z {judged.z_m[worst]:.1f} m with {', '.join(dead) or 'none'}"
-        f" dead; least confusion {', '.join(f'{k} {v:.3f} m' for k, v in confusion.items())}"
+        f"worst level over limit {judged.ratio[worst]:.2f} at z {judged.z_m[worst]:.1f} m with"
+        f" {', '.join(dead) or 'none'} dead; least confusion {', '.join(f'{k} {v:.3f} m' for k, v in confusion.items())}"
     )
     options = "" if seed is None else f" --seed {seed}"
     about = f"Made by: lumidock station design {source.name} --out {out.name}{options}\n{told}"
@@ -69,7 +69,9 @@ def _design(
         rival = load_station(shipped_or_path("station", DEFAULT_STATION))
         rival_approach = approach_of(spec, rival)
         rival_judged = strength(rival, lens, Config(), rival_approach, dead_sets(len(rival), min(spec.dead, 1)))
-        alone = strength(found.station, lens, Config(), approach_of(spec, found.station), dead_sets(len(found.station), 1))
+        alone = strength(
+            found.station, lens, Config(), approach_of(spec, found.station), dead_sets(len(found.station), 1)
+        )
         view = DesignView(found.station, rival, judged, rival_judged, alone, confusion, spec.dead, told)
         pages.write(page, design_page(view))
     if as_json:

@@ -181,7 +181,9 @@ def _summary(found: Survey) -> dict[str, Any]:
         "held_out_px": {"drawing": found.held_out_px[0], "survey": found.held_out_px[1]},
         "scale_sigma": found.scale_sigma,
         "calibrated": found.adjusted.calibrated,
-        "calibration": dict(zip(("focal", "u_px", "v_px"), found.adjusted.estimate.calibration[:3].tolist(), strict=True)),
+        "calibration": dict(
+            zip(("focal", "u_px", "v_px"), found.adjusted.estimate.calibration[:3].tolist(), strict=True)
+        ),
         "unobserved": list(found.unobserved),
         "lights": [
             {
@@ -261,4 +263,8 @@ def _write_page(found: Survey, lens: Camera, target: Path) -> None:
 
 
 def _side(degrees: float, one: str, other: str) -> str:
-    return f"straight ahead of {one}" if degrees == 0.0 else f"{abs(degrees):g} degrees to the {one if degrees > 0 else other}"
+    return (
+        f"straight ahead of {one}"
+        if degrees == 0.0
+        else f"{abs(degrees):g} degrees to the {one if degrees > 0 else other}"
+    )

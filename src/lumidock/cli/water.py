@@ -41,7 +41,9 @@ def _water(
     square: Annotated[float, typer.Option(metavar="M", help="Side of a square.")] = 0.04,
     marker: Annotated[float, typer.Option(metavar="M", help="Side of a marker of a ChArUco board.")] = 0.03,
     dictionary: Annotated[str, typer.Option(metavar="NAME", help="OpenCV's name of its dictionary.")] = "DICT_4X4_50",
-    model: Annotated[str, typer.Option(metavar="MODEL", help="plumb_bob, or equidistant for a wide lens.")] = "plumb_bob",
+    model: Annotated[
+        str, typer.Option(metavar="MODEL", help="plumb_bob, or equidistant for a wide lens.")
+    ] = "plumb_bob",
     dock: Annotated[
         list[Path] | None, typer.Option("--dock", metavar="RUN", help="Refine from a run's lights; may be repeated.")
     ] = None,
@@ -98,7 +100,9 @@ def _sightings(source: str, board: Board, fps: float | None) -> tuple[list[Sight
                 found.append(sighting)
     if size is None:
         raise InputError(f"{source}: no frame that can be read")
-    chosen = np.unique(np.linspace(0, len(found) - 1, min(len(found), _MOST_VIEWS)).round().astype(int)) if found else []
+    chosen = (
+        np.unique(np.linspace(0, len(found) - 1, min(len(found), _MOST_VIEWS)).round().astype(int)) if found else []
+    )
     return [found[k] for k in chosen], size
 
 
@@ -155,6 +159,6 @@ def _from_dock(runs: list[Path], out: Path, as_json: bool) -> None:
         print(json.dumps(told, indent=1))
     else:
         print(
-            f"focal length {100 * focal:+.3f} +- {100 * sigma[0]:.3f} %, centre {du:+.2f} {dv:+.2f} +- {sigma[1]:.2f} px"
-            f" against the file; written to {out}"
+            f"focal length {100 * focal:+.3f} +- {100 * sigma[0]:.3f} %, centre {du:+.2f} {dv:+.2f}"
+            f" +- {sigma[1]:.2f} px against the file; written to {out}"
         )

@@ -56,9 +56,7 @@ def seen_along(station: Station, camera: Camera, approach: Approach) -> np.ndarr
     return out
 
 
-def level_ratios(
-    station: Station, camera: Camera, config: Config, approach: Approach, seen: np.ndarray
-) -> Array:
+def level_ratios(station: Station, camera: Camera, config: Config, approach: Approach, seen: np.ndarray) -> Array:
     """The largest of the protection levels over their alert limits at each place (K,), with the lights `seen` (K, M).
 
     `NO_LEVEL` where the bound gives none, and 0 before the part of the approach that is judged.
@@ -67,7 +65,9 @@ def level_ratios(
     slower = config.model_copy(update={"match": config.match.model_copy(update={"noise_px": noise})})
     bound, out = Bound(station, camera, slower), np.full(len(seen), NO_LEVEL)
     for k, z in enumerate(approach.z_m()):
-        level = bound.step(round(k * 1e9 / approach.step_hz), head_on(float(z)), np.flatnonzero(seen[k]).astype(np.int64))
+        level = bound.step(
+            round(k * 1e9 / approach.step_hz), head_on(float(z)), np.flatnonzero(seen[k]).astype(np.int64)
+        )
         if z > approach.from_z_m + 1e-9:
             out[k] = 0.0
         elif level is not None and np.isfinite(level).all():

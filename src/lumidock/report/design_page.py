@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from lumidock.evaluation.dead_lights import Strength
 from lumidock.report import page
 from lumidock.report.page import PageSection, Plot, Table, Tile

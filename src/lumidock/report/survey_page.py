@@ -10,7 +10,7 @@ import numpy as np
 
 from lumidock.datatypes import Array, Indices
 from lumidock.report import page
-from lumidock.report.page import Plot, PageSection, Table, Tile
+from lumidock.report.page import PageSection, Plot, Table, Tile
 from lumidock.report.plots import COLORS, plot
 from lumidock.station import Station
 
@@ -54,7 +54,9 @@ def survey_page(view: SurveyView) -> str:
         " were seen fit the drawing best, so the docking point keeps its place among them."
     )
     sections = [
-        PageSection("Result", text=view.refusal and f"Refused: {view.refusal}.", tiles=_tiles(view), items=[_dock(view)]),
+        PageSection(
+            "Result", text=view.refusal and f"Refused: {view.refusal}.", tiles=_tiles(view), items=[_dock(view)]
+        ),
         PageSection("Each light", items=[_lights(view)]),
         PageSection("Residuals", text=_RESIDUALS, items=[_residuals(view)]),
         PageSection("What the footage leaves open", items=[_listed("Not observed", view.unobserved)]),

@@ -14,7 +14,9 @@ from lumidock.camera import Camera
 from lumidock.datatypes import Array, Indices
 from lumidock.setup.observations import LEAST_LIGHTS, Observations
 
-CALIBRATION = 5  # relative focal error; shift of the principal point u, v px; radial distortion beyond the file's k1, k2
+CALIBRATION = (
+    5  # relative focal error; shift of the principal point u, v px; radial distortion beyond the file's k1, k2
+)
 _CAUCHY = 3.0  # sigmas at which a residual counts half; costs 5 % of efficiency on Gaussian noise
 _OUTLIER = 4.0  # sigmas beyond which a detection says nothing; 1 in 3000 by chance in two dimensions
 _MEDIAN_CHI2 = 1.386  # of two degrees of freedom
@@ -182,7 +184,10 @@ def _linearised(observed: Observations, camera: Camera, at: Estimate) -> _Linear
     scale = 1.0 + focal + k1 * r2 + k2 * r2 * r2
     expected = from_center * scale + camera.center_px + at.calibration[1:3]
     stretch = scale[..., None] * np.eye(2)
-    stretch = stretch + 2.0 * (k1 + 2.0 * k2 * r2)[..., None] * from_center[..., :, None] * (x / camera.focal_px)[..., None, :]
+    stretch = (
+        stretch
+        + 2.0 * (k1 + 2.0 * k2 * r2)[..., None] * from_center[..., :, None] * (x / camera.focal_px)[..., None, :]
+    )
     J = stretch @ J_uv_p.reshape(f, m, 2, 3)
     residual = observed.uv - expected
     good = np.isfinite(residual).all(axis=2)
@@ -192,7 +197,9 @@ def _linearised(observed: Observations, camera: Camera, at: Estimate) -> _Linear
         J_calibration[..., column] = np.where(good[..., None], from_center * factor, 0.0)
     J_calibration[..., 0, 1] = J_calibration[..., 1, 2] = good
     J_pose = np.concatenate([-J, J @ _skews(p_cam)], axis=3)
-    return _Linear(np.where(good[..., None], residual, np.nan), J_pose, J @ R_dock_cam.swapaxes(1, 2)[:, None], J_calibration)
+    return _Linear(
+        np.where(good[..., None], residual, np.nan), J_pose, J @ R_dock_cam.swapaxes(1, 2)[:, None], J_calibration
+    )
 
 
 def _skews(p: Array) -> Array:
@@ -283,9 +290,7 @@ def _stepped(at: Estimate, normal: _Normal, damping: float) -> Estimate:
     shared = np.linalg.solve(S, normal.c - reduced[:, s])
     poses = AB[..., s] - AB[..., :s] @ shared
     m3 = at.p_dock.size
-    return Estimate(
-        at.p_dock + shared[:m3].reshape(-1, 3), _moved(at.T_dock_cam, poses), at.calibration + shared[m3:]
-    )
+    return Estimate(at.p_dock + shared[:m3].reshape(-1, 3), _moved(at.T_dock_cam, poses), at.calibration + shared[m3:])
 
 
 def _moved(T_dock_cam: Array, xi: Array) -> Array:

@@ -26,8 +26,8 @@ from lumidock.evaluation.dead_lights import (
     level_ratios,
     seen_along,
 )
-from lumidock.station import Color, Name, Station, Vector, load_station
 from lumidock.setup.station_files import write_station_file
+from lumidock.station import Color, Name, Station, Vector, load_station
 from lumidock.yamlfile import read_mapping, validate
 
 _WORST_SETS, _NEW_SETS = 3, 1  # of dead lights in one evaluation: those that were worst lately, and others by chance

@@ -14,7 +14,7 @@ import numpy as np
 
 from lumidock.camera import Camera
 from lumidock.config import Config
-from lumidock.datatypes import Array, Detections, Indices
+from lumidock.datatypes import Array, Detections
 from lumidock.errors import InputError
 from lumidock.pose import sqpnp
 from lumidock.setup import bundle
@@ -45,9 +45,9 @@ class Survey:
     `after` is the drawing with the new positions; `sigma_m` (M, 3) the 1-sigma error of each in the dock's axes and
     `covariance` (3M, 3M) of all, the dock's frame taken as the one in which the lights that were seen fit the true
     ones best. `scale_sigma` is the relative error of the size of the whole, which is not in `sigma_m`: it acts as an
-    error of the focal length does, and `after` counts it there. `held_out_px` are the rms residuals of frames that had no part in the adjustment: with the
-    drawing, and with the positions from the other frames. `unobserved` says in words what the footage left open.
-    `refusal` is empty where the result may be used.
+    error of the focal length does, and `after` counts it there. `held_out_px` are the rms residuals of frames that had
+    no part in the adjustment: with the drawing, and with the positions from the other frames. `unobserved` says in
+    words what the footage left open. `refusal` is empty where the result may be used.
     """
 
     before: Station
@@ -78,9 +78,8 @@ def survey(
     """
     station, sigma, estimate, rounds = drawing, prior.sigma_m, None, 0
     lists = [list(recording) for recording in recordings]
-    calibrated = camera
-    for rounds in range(1, _ROUNDS + 1):
-        observed = identify(lists, _declared(station, sigma), calibrated, config, progress)
+    while True:
+        observed = identify(lists, _declared(station, sigma), camera, config, progress)
         observed, poses = _usable(observed, camera, station.p_dock, sigma)
         calibration = estimate.calibration if estimate else np.zeros(CALIBRATION)
         adjusted = bundle.adjust(observed, camera, prior, Estimate(station.p_dock, poses, calibration))
@@ -89,9 +88,9 @@ def survey(
         covariance = shape_covariance(adjusted.covariance, estimate.p_dock, adjusted.used.any(axis=0))
         station = replace(station, p_dock=estimate.p_dock)
         sigma = np.maximum(np.sqrt(np.diagonal(covariance)).reshape(-1, 3), _LEAST_SIGMA_M)
-        if (moved < _SETTLED * sigma + 1e-4).all():
-            break
-    return _conclude(drawing, camera, prior, observed, adjusted, rounds)
+        rounds += 1
+        if rounds == _ROUNDS or (moved < _SETTLED * sigma + 1e-4).all():
+            return _conclude(drawing, camera, prior, observed, adjusted, rounds)
 
 
 def prior_of(
@@ -124,10 +123,8 @@ def _declared(station: Station, sigma_m: Array) -> Station:
     return replace(station, sigma_light_m=np.sqrt((sigma_m**2).mean(axis=1)), sigma_layer_m=0.0)
 
 
-def _usable(
-    observed: Observations, camera: Camera, p_dock: Array, sigma_m: Array
-) -> tuple[Observations, Array]:
-    """The frames whose pose is clear, thinned, with these poses (F, 4, 4). Raises: InputError where they are too few."""
+def _usable(observed: Observations, camera: Camera, p_dock: Array, sigma_m: Array) -> tuple[Observations, Array]:
+    """The frames whose pose is clear, thinned, with these poses (F, 4, 4). Raises: InputError for too few."""
     if observed.share < _LEAST_SHARE:
         raise InputError(
             f"lights were identified in only {100 * observed.share:.0f} % of the frames that show them: this is another"

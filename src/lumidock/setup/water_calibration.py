@@ -27,7 +27,6 @@ _OUTLIER = 4.0  # times the rms residual: a corner beyond it was misread
 _CELLS = (5, 4)  # of the coverage map, across and down
 _COVERED = 20  # corners in a cell that hold its distortion down; a board seen once in it
 _STEEP_DEG = 20.0  # tilt from which a view separates focal length from distance
-_PARAMETERS = {"plumb_bob": 8, "equidistant": 8}  # fx, fy, cx, cy and k1, k2, p1, p2, or k1-k4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +110,7 @@ def _fit(board: Board, sightings: Sequence[Sighting], size: tuple[int, int], mod
     with extra("setup"):
         from scipy.optimize import least_squares
     corners = board.corners_m()
-    x0 = _start(corners, sightings, size, model)
+    x0 = _start(corners, sightings, size)
     used = [np.ones(len(one.corner), bool) for one in sightings]
     for last in (False, True):
 
@@ -161,7 +160,7 @@ def _project(p: Array, pose: Array, parameters: Array, model: Model) -> tuple[Ar
     return np.asarray(uv).reshape(-1, 2), J[:, :, order]
 
 
-def _start(corners: Array, sightings: Sequence[Sighting], size: tuple[int, int], model: Model) -> Array:
+def _start(corners: Array, sightings: Sequence[Sighting], size: tuple[int, int]) -> Array:
     """Zhang's closed form for the focal length, then the pose of every view by it."""
     objects = [corners[one.corner].astype(np.float32) for one in sightings]
     pixels = [one.uv.astype(np.float32)[:, None] for one in sightings]
