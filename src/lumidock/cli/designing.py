@@ -57,7 +57,8 @@ def _design(
     dead = [found.station.ids[i] for i in judged.dead[int(judged.worst[worst])]]
     told = (
         f"worst level over limit {judged.ratio[worst]:.2f} at z {judged.z_m[worst]:.1f} m with"
-        f" {', '.join(dead) or 'none'} dead; least confusion {', '.join(f'{k} {v:.3f} m' for k, v in confusion.items())}"
+        f" {', '.join(dead) or 'none'} dead;"
+        f" least confusion {', '.join(f'{k} {v:.3f} m' for k, v in confusion.items())}"
     )
     options = "" if seed is None else f" --seed {seed}"
     about = f"Made by: lumidock station design {source.name} --out {out.name}{options}\n{told}"
