@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
 import typer
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from lumidock.setup.bundle import Distance
     from lumidock.setup.survey import Survey
 
+_LEAST_OF_A_COLOR = 4  # lights; of fewer the way they move together says too little
 _CHECK_SIGMA_M = 0.05  # how far a light may have moved since the survey and still be found
 
 
@@ -60,6 +62,7 @@ class _SurveyCommand(TyperCommand):
     epilog=example(
         "lumidock survey RUN-1 RUN-2 RUN-3 --station drawing.yaml --off 0.05 --distance F1 R5 5.482 --out dock.yaml",
         "lumidock survey dive.mp4 --station drawing.yaml --camera camera.yaml --out dock.yaml --page survey.html",
+        "lumidock survey RUN-1 --lights 7,6 --out dock.yaml",
         "lumidock survey RUN-9 --station dock.yaml --check",
     ),
 )
@@ -67,7 +70,13 @@ def _survey(
     sources: Annotated[
         list[str], typer.Argument(metavar="RUN_OR_SOURCE...", help="Run folders or recordings of approaches.")
     ],
-    station: Annotated[str, typer.Option("--station", metavar="FILE", help="The drawing, or with --check the survey.")],
+    station: Annotated[
+        str | None, typer.Option("--station", metavar="FILE", help="The drawing, or with --check the survey.")
+    ] = None,
+    lights: Annotated[
+        str | None,
+        typer.Option(metavar="F,R", help="No drawing: how many lights of the front's and of the rear's colour."),
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Station file to write.")] = None,
     camera: CameraOption = None,
     off: Annotated[
@@ -97,8 +106,13 @@ def _survey(
     for file in (out, page):
         if file is not None:
             require_new(file, force)
-    path = shipped_or_path("station", station)
-    drawing, settings = load_station(path), load_config(config) if config else Config()
+    settings = load_config(config) if config else Config()
+    if (station is None) == (lights is None) or (check and station is None):
+        raise InputError("give --station FILE, or for a dock of two colours without a drawing --lights F,R")
+    path = shipped_or_path("station", station) if station is not None else cast("Path", out)
+    if lights is not None:
+        _write_layout(sources, camera, lights, distances or [], path)
+    drawing = load_station(path)
     tapes = [_distance(text, drawing, distance_sigma) for text in distances or ()]
     prior = prior_of(drawing, sigma_m=_CHECK_SIGMA_M if check else off, known=known or (), distances=tapes)
     with progress_bar("survey") as progress:
@@ -108,12 +122,44 @@ def _survey(
         _write(found, path, out)
     if page is not None:
         _write_page(found, lens, page)
+    if found.refusal and lights is not None:
+        path.unlink()
     if found.refusal:
         raise InputError(f"survey refused: {found.refusal}")
     if out is None:
         _report_moves(found, drawing, as_json)
         return
     print(json.dumps(_summary(found), indent=1) if as_json else _told(found, out))
+
+
+def _write_layout(sources: list[str], camera: str | None, lights: str, distances: list[str], path: Path) -> None:
+    """Write the station file of a first layout, of the size that the first taped distance says."""
+    from lumidock.setup.recordings import detections_of_run, is_run
+    from lumidock.setup.station_files import content_of, write_station_file
+    from lumidock.setup.unknown import first_layout
+
+    front, _, rear = lights.partition(",")
+    if not (front.isdecimal() and rear.isdecimal() and min(int(front), int(rear)) >= _LEAST_OF_A_COLOR):
+        raise InputError(f"--lights {lights}: wanted two numbers of at least {_LEAST_OF_A_COLOR}, as in --lights 7,6")
+    recordings, lens = [], None
+    for source in sources:
+        folder = Path(source)
+        if is_run(folder):
+            lens = load_camera(shipped_or_path("camera", camera) if camera else folder / "camera.yaml")
+            recordings.append(detections_of_run(folder))
+            continue
+        opened = open_any(source, None)
+        if opened.kind != "detections":
+            raise InputError(f"{source}: --lights wants run folders; make one with lumidock run and any station file")
+        lens = calibration_of(camera, opened)
+        recordings.append([item for item in opened.items() if isinstance(item, Detections)])
+    assert lens is not None
+    layout = first_layout(recordings, int(front), int(rear), lens, Config().match.noise_px)
+    for text in distances[:1]:
+        tape = _distance(text, layout, 1.0)
+        size = tape.metres / float(np.linalg.norm(layout.p_dock[tape.a] - layout.p_dock[tape.b]))
+        layout = replace(layout, p_dock=layout.p_dock * size)
+    write_station_file(content_of(layout), path, "First layout, from footage alone.")
 
 
 def _distance(text: str, drawing: Station, sigma_m: float) -> Distance:

@@ -34,7 +34,7 @@ _WORST_SETS, _NEW_SETS = 3, 1  # of dead lights in one evaluation: those that we
 _SEARCH_HZ = 1.0  # steps of the bound in the search; the layout that is found is judged at twice that
 _FORGET = 0.9  # how much of a set's last ratio counts when it was not tried again
 _FIRST_SPREAD = 0.25  # of a rail's length
-_SPACING_WEIGHT, _CONFUSION_WEIGHT = 20.0, 20.0  # cost per m that is missing; a ratio of 2 costs 0.3
+_SPACING_WEIGHT, _CONFUSION_WEIGHT = 20.0, 100.0  # cost per m that is missing; twice the ratio costs 0.3
 _CENTIMETRES = 2  # decimals of a position in m
 
 Positive = Annotated[float, Field(gt=0.0)]

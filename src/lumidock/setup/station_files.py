@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from lumidock.datatypes import Array
@@ -49,5 +50,27 @@ def write_station_file(content: dict[str, Any], target: Path, about: str) -> Non
     target.write_text(f"{comment}{head}lights:\n{rows}", encoding="utf-8")
 
 
+def content_of(station: Station) -> dict[str, Any]:
+    """The content of a station file of a station whose lights are all known alike."""
+    return {
+        "schema": 1,
+        "name": station.name,
+        "docking_point": station.docking_point.tolist(),
+        "survey_sigma": {"light_m": float(np.max(station.sigma_light_m)), "layer_m": station.sigma_layer_m},
+        "lights": [
+            {
+                "id": light_id,
+                "layer": station.layers[station.layer[i]],
+                "position": [round(float(x), _DECIMALS_M) for x in station.p_dock[i]],
+                "color": station.color[i],
+                "axis": [round(float(x), 6) for x in station.axis[i]],
+                "beam_deg": float(station.beam_deg[i]),
+                "power_w": float(station.power_w[i]),
+            }
+            for i, light_id in enumerate(station.ids)
+        ],
+    }
+
+
 def _up(value: float) -> float:
-    return round(math.ceil(value * 10**_DECIMALS_M - 1e-9) / 10**_DECIMALS_M, _DECIMALS_M)
+    return float(round(math.ceil(value * 1e4 - 1e-9) / 1e4, _DECIMALS_M))

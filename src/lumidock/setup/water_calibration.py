@@ -157,7 +157,7 @@ def _project(p: Array, pose: Array, parameters: Array, model: Model) -> tuple[Ar
         uv, J = cv2.projectPoints(p, pose[:3], pose[3:], K, np.append(parameters[4:], 0.0))
         J = np.asarray(J).reshape(-1, 2, 15)  # rotation, translation, f, c, k1, k2, p1, p2, k3
         order = list(range(14))
-    return np.asarray(uv).reshape(-1, 2), J[:, :, order]
+    return np.asarray(uv, float).reshape(-1, 2), np.asarray(J[:, :, order], float)
 
 
 def _start(corners: Array, sightings: Sequence[Sighting], size: tuple[int, int]) -> Array:
@@ -195,7 +195,8 @@ def _view_rms(board: Board, one: Sighting, parameters: Array, model: Model) -> f
 def _coverage(sightings: Sequence[Sighting], size: tuple[int, int]) -> np.ndarray:
     uv = np.concatenate([one.uv for one in sightings])
     bins = [np.linspace(-0.5, side - 0.5, cells + 1) for side, cells in zip(size, _CELLS, strict=True)]
-    return np.histogram2d(uv[:, 1], uv[:, 0], bins=[bins[1], bins[0]])[0].astype(int)
+    counts = np.histogram2d(uv[:, 1], uv[:, 0], bins=[bins[1], bins[0]])[0]
+    return np.asarray(counts.astype(np.int64))
 
 
 def _advice(coverage: np.ndarray, poses: Array) -> tuple[str, ...]:
