@@ -43,7 +43,7 @@ _CHECK_SIGMA_M = 0.05  # how far a light may have moved since the survey and sti
 class _SurveyCommand(TyperCommand):
     """A command whose `--distance` takes three words and may be repeated, which typer does not offer."""
 
-    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401  # typer does not export its type
         """The arguments, each `--distance A B M` made one word."""
         joined: list[str] = []
         while args:

@@ -100,9 +100,7 @@ def _sightings(source: str, board: Board, fps: float | None) -> tuple[list[Sight
                 found.append(sighting)
     if size is None:
         raise InputError(f"{source}: no frame that can be read")
-    chosen = (
-        np.unique(np.linspace(0, len(found) - 1, min(len(found), _MOST_VIEWS)).round().astype(int)) if found else []
-    )
+    chosen = np.linspace(0, len(found) - 1, min(len(found), _MOST_VIEWS)).round().astype(int)
     return [found[k] for k in chosen], size
 
 

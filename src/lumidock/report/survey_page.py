@@ -127,7 +127,7 @@ def _draw_light(axes: Axes, view: SurveyView, i: int, plane: tuple[int, int], gr
     angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
     axes.add_patch(Ellipse((now[0], now[1]), size[1], size[0], angle=angle, fill=False, color=color, lw=0.9))
     if plane == (0, 1):
-        axes.annotate(view.before.ids[i], drawn, xytext=(6, 5), textcoords="offset points", fontsize=8)
+        axes.annotate(view.before.ids[i], (drawn[0], drawn[1]), xytext=(6, 5), textcoords="offset points", fontsize=8)
 
 
 def _lights(view: SurveyView) -> Table:

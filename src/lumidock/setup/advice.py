@@ -37,7 +37,7 @@ class View:
 def helpful_views(found: Survey, camera: Camera, most: int = 3) -> list[View]:
     """The views that would lower the rms error of the positions most, the best first."""
     p_dock = found.adjusted.estimate.p_dock
-    now, seen = np.trace(found.covariance), found.adjusted.used.any(axis=0)
+    now, seen = np.trace(found.covariance), found.adjusted.seen
     information = np.linalg.inv(found.adjusted.covariance)
     noise = float(np.median(found.observed.sigma_px)) * float(np.median(found.adjusted.noise))
     views = []

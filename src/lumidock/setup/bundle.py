@@ -77,6 +77,11 @@ class Adjusted:
     repeats: float
     calibrated: bool
 
+    @property
+    def seen(self) -> np.ndarray:
+        """Which lights (M,) have any detection that agrees."""
+        return np.asarray(self.used.any(axis=0))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Linear:
@@ -213,7 +218,7 @@ def _skews(p: Array) -> Array:
 def _weights(residual: Array, sigma: Array) -> Array:
     """Weights (F, M) 1/px^2 of the residuals (F, M, 2); 0 where there is none."""
     r2 = (residual**2).sum(axis=2) / sigma**2
-    return np.nan_to_num(1.0 / (sigma**2 * (1.0 + r2 / _CAUCHY**2)))
+    return np.asarray(np.nan_to_num(1.0 / (sigma**2 * (1.0 + r2 / _CAUCHY**2))))
 
 
 def _frame_costs(observed: Observations, camera: Camera, at: Estimate, sigma: Array) -> Array:
@@ -313,7 +318,7 @@ def _noise_of(observed: Observations, camera: Camera, at: Estimate) -> Array:
     noise = np.full(r2.shape[1], everyone)
     for light in np.flatnonzero(np.isfinite(r2).sum(axis=0) >= _ENOUGH):
         noise[light] = np.sqrt(np.nanmedian(r2[:, light]) / _MEDIAN_CHI2) / share
-    return np.maximum(noise, np.maximum(_LEAST_NOISE, 0.3 * everyone))
+    return np.asarray(np.maximum(noise, np.maximum(_LEAST_NOISE, 0.3 * everyone)))
 
 
 def _conclude(
@@ -351,7 +356,7 @@ def _considered(S: Array, calibration_sigma: Array) -> Array:
 
 def _expected_chi2(used: np.ndarray) -> float:
     """Mean square in sigmas of the residuals that the unknowns leave."""
-    equations, unknowns = 2 * used.sum(), 6 * len(used) + 3 * used.shape[1]
+    equations, unknowns = 2 * int(used.sum()), 6 * len(used) + 3 * used.shape[1]
     return 2.0 * max(1.0 - unknowns / max(equations, 1), 0.1)
 
 

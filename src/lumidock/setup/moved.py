@@ -33,7 +33,7 @@ def moves(later: Survey, sigma_m: Array) -> Moves:
     fit repeated, until the others agree or only half remain.
     """
     filed, found = later.before.p_dock, later.after.p_dock
-    unseen = ~later.adjusted.used.any(axis=0)
+    unseen = ~later.adjusted.seen
     variance = sigma_m**2 + later.sigma_m**2
     stayed = ~unseen
     while True:

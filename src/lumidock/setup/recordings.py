@@ -42,8 +42,8 @@ def detections_of_run(folder: Path) -> list[Detections]:
         table = np.array(numbers)
         table = table[np.isfinite(table[:, :2]).all(axis=1)]
         if t_ns.lstrip("-").isdecimal() and len(table):
-            uv, radius, flux, p_light, p_rear = table[:, :2], *table[:, 2:].T
-            out.append(Detections(frame, int(t_ns), uv, radius, flux, np.nan_to_num(p_light, nan=1.0), p_rear))
+            sure = np.nan_to_num(table[:, 4], nan=1.0)
+            out.append(Detections(frame, int(t_ns), table[:, :2], table[:, 2], table[:, 3], sure, table[:, 5]))
     return out
 
 

@@ -85,7 +85,7 @@ def survey(
         adjusted = bundle.adjust(observed, camera, prior, Estimate(station.p_dock, poses, calibration))
         moved = np.abs(adjusted.estimate.p_dock - station.p_dock)
         estimate = adjusted.estimate
-        covariance = shape_covariance(adjusted.covariance, estimate.p_dock, adjusted.used.any(axis=0))
+        covariance = shape_covariance(adjusted.covariance, estimate.p_dock, adjusted.seen)
         station = replace(station, p_dock=estimate.p_dock)
         sigma = np.maximum(np.sqrt(np.diagonal(covariance)).reshape(-1, 3), _LEAST_SIGMA_M)
         rounds += 1
@@ -211,9 +211,9 @@ def _conclude(
     drawing: Station, camera: Camera, prior: Prior, observed: Observations, adjusted: Adjusted, rounds: int
 ) -> Survey:
     estimate = adjusted.estimate
-    covariance = shape_covariance(adjusted.covariance, estimate.p_dock, adjusted.used.any(axis=0))
+    covariance = shape_covariance(adjusted.covariance, estimate.p_dock, adjusted.seen)
     sigma = np.maximum(np.sqrt(np.diagonal(covariance)).reshape(-1, 3), _LEAST_SIGMA_M)
-    seen = adjusted.used.any(axis=0)
+    seen = adjusted.seen
     scale = scale_sigma(adjusted.covariance, estimate.p_dock, seen)
     scale_before = scale_sigma(np.diag(prior.sigma_m.ravel() ** 2), prior.p_dock, seen)
     held_out = _held_out(observed, camera, prior, adjusted)
@@ -253,7 +253,7 @@ def _unobserved(
 ) -> tuple[str, ...]:
     """What the footage left as it was, in words, with what would settle it."""
     said = []
-    unseen = [drawing.ids[i] for i in np.flatnonzero(~adjusted.used.any(axis=0))]
+    unseen = [drawing.ids[i] for i in np.flatnonzero(~adjusted.seen)]
     if unseen:
         said.append(f"never seen, as drawn: {', '.join(unseen)}; bring them into view, or check that they are lit")
     weak = [
@@ -289,7 +289,7 @@ def _refusal(prior: Prior, adjusted: Adjusted, held_out_px: tuple[float, float],
     agree = adjusted.used.sum() / max(observed.seen.sum(), 1)
     if agree < 0.8:
         return f"only {100 * agree:.0f} % of the identified detections agree with the result"
-    seen = adjusted.used.any(axis=0)
+    seen = adjusted.seen
     if seen.mean() < _LEAST_LIT:
         return f"only {seen.sum()} of {len(seen)} lights were identified: this is another dock, or most of it is dark"
     moved = (adjusted.estimate.p_dock - prior.p_dock) / prior.sigma_m

@@ -18,7 +18,7 @@ from lumidock.pose import sqpnp
 from lumidock.setup import bundle
 from lumidock.setup.bundle import CALIBRATION, Estimate, Prior
 from lumidock.setup.observations import LEAST_LIGHTS, Observations
-from lumidock.station import Station
+from lumidock.station import Color, Station
 
 _WINDOW = 12  # frames over which lights are told from what passes by
 _STEP_PX = 0.012  # of the picture's width: how far a light moves from one frame to the next at most
@@ -26,6 +26,8 @@ _TOGETHER_PX = 3.0  # how far a light may be from where the motion of its layer 
 _PERSISTENT = 0.7  # of a window's frames in which a light is detected
 _DEPTHS_M = (0.5, 1.5, 3.0, 5.0, 8.0)  # between the layers, in rms radii of the front one
 _GUESS_SIGMA_M = 2.0
+_FRONT_COLOR: tuple[Color, ...] = ("white",)
+_REAR_COLOR: tuple[Color, ...] = ("blue",)
 _MOST_FRAMES = 120
 _MOST_NOISE = 3.0  # times the stated error of the centres: a layout that fits no better is wrong
 
@@ -106,7 +108,7 @@ def _seeds(frames: list[Array], count: int, reach: float) -> Array | None:
 
 
 def _nearest(points: Array, others: Array, reach: float) -> Indices:
-    """For each point (N, 2) the index of the nearest of `others`, -1 beyond `reach` or where another is nearer to it."""
+    """For each point (N, 2) the nearest of `others`, -1 beyond `reach` or where another is nearer to it."""
     out = np.full(len(points), -1, np.int64)
     if not len(points) or not len(others):
         return out
@@ -135,7 +137,8 @@ def _moving_together(now: Array, before: Array) -> np.ndarray:
 
 def _backward(frames: list[Array], seed: Array, reach: float) -> Array:
     """The lights (N, M, 2), from the last frame back; ends where fewer than four, or half, can be followed."""
-    at, out = seed.copy(), []
+    at = seed.copy()
+    out: list[Array] = []
     enough = max(LEAST_LIGHTS, (len(seed) + 1) // 2)
     for points in reversed(frames):
         nearest = _nearest(at, points, reach)
@@ -206,7 +209,7 @@ def _station(p_dock: Array, front: int, rear: int) -> Station:
         layers=("front", "rear"),
         layer=np.repeat([0, 1], [front, rear]).astype(np.int64),
         p_dock=p_dock,
-        color=(*("white",) * front, *("blue",) * rear),
+        color=_FRONT_COLOR * front + _REAR_COLOR * rear,
         axis=np.tile([0.0, 0.0, 1.0], (n, 1)),
         beam_deg=np.full(n, 120.0),
         power_w=np.full(n, 2.0),
