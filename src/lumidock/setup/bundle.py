@@ -357,7 +357,7 @@ def _considered(S: Array, calibration_sigma: Array) -> Array:
 def _expected_chi2(used: np.ndarray) -> float:
     """Mean square in sigmas of the residuals that the unknowns leave."""
     equations, unknowns = 2 * int(used.sum()), 6 * len(used) + 3 * used.shape[1]
-    return 2.0 * max(1.0 - unknowns / max(equations, 1), 0.1)
+    return float(2.0 * max(1.0 - unknowns / max(equations, 1), 0.1))
 
 
 def _repeats(observed: Observations, residual: Array, used: np.ndarray) -> float:

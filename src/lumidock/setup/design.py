@@ -26,6 +26,7 @@ from lumidock.evaluation.dead_lights import (
     level_ratios,
     seen_along,
 )
+from lumidock.setup.observations import LEAST_LIGHTS
 from lumidock.setup.station_files import write_station_file
 from lumidock.station import Color, Name, Station, Vector, load_station
 from lumidock.yamlfile import read_mapping, validate
@@ -131,10 +132,9 @@ def design(
         costs = [judge.cost(np.asarray(u)) for u in asked]
         search.tell(asked, costs)
         progress(judge.evaluations, spec.evaluations)
-        # a set that was not tried flatters a layout, so the best of a generation is judged by all that were bad
+        # a set that was not tried flatters a layout, so what seems better than the best is judged by all of them
         u = np.asarray(asked[int(np.argmin(costs))])
-        cost = judge.full_cost(u)
-        if cost < best_cost:
+        if min(costs) < best_cost and (cost := judge.full_cost(u)) < best_cost:
             best, best_cost = u, cost
     content = layout(spec, best)
     return Design(content, judge.station(best), best_cost, judge.evaluations)
@@ -187,9 +187,8 @@ class _Judge:
         return self._judged(u, sorted({*worst.tolist(), *others.tolist()}))
 
     def full_cost(self, u: Array) -> float:
-        """Cost by more of the sets: all that were nearly as bad as the worst."""
-        order = np.argsort(-self._bad, kind="stable")
-        return self._judged(u, order[: 4 * _WORST_SETS].tolist())
+        """Cost by all sets of dead lights."""
+        return self._judged(u, list(range(len(self._dead))))
 
     def _judged(self, u: Array, sets: list[int]) -> float:
         try:
@@ -205,7 +204,13 @@ class _Judge:
             ratio = level_ratios(station, self.camera, self.config, approach, lit)
             ratios.append(ratio)
             self._bad[k] = _badness(ratio)
-        return max(_badness(ratio) for ratio in ratios) + self._faults(station)
+        return max(_badness(ratio) for ratio in ratios) + self._faults(station) + self._blind(seen, approach)
+
+    def _blind(self, seen: np.ndarray, approach: Approach) -> float:
+        """The share of the approach where some set of dead lights leaves fewer than four in view, for a start."""
+        judged = approach.z_m() <= approach.from_z_m
+        left = np.array([(seen[judged] & ~np.isin(np.arange(seen.shape[1]), dead)).sum(axis=1) for dead in self._dead])
+        return float((left.min(axis=0) < LEAST_LIGHTS).mean())
 
     def _faults(self, station: Station) -> float:
         """What confusion, lights too near to each other and lights in keep-out boxes cost."""
