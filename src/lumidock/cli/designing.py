@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from lumidock.camera import load_camera
@@ -90,3 +91,38 @@ def _design(
         )
     else:
         print(f"{told}; {found.evaluations} layouts tried; written to {out}")
+
+
+@station.command("strength", epilog=example("lumidock station strength dock.yaml --dead 2 --speed 0.2"))
+def _strength(
+    source: Annotated[str, typer.Argument(metavar="FILE", help="Station file, or the name of a shipped one.")],
+    camera: CameraOption = None,
+    dead: Annotated[int, typer.Option(metavar="N", min=0, max=2, help="Any so many lights may be dead.")] = 2,
+    speed: Annotated[float, typer.Option(metavar="M/S", min=0.02, help="Speed of the approach.")] = 0.2,
+    from_z: Annotated[float, typer.Option(metavar="Z", help="Judged from here to the docking point.")] = 20.0,
+    reach: Annotated[float, typer.Option(metavar="M", min=1.0, help="How far the water shows a light.")] = 27.0,
+    as_json: AsJson = False,
+) -> None:
+    """Say what a dock still gives with lights dead; exit code 1 where the pose would not be valid."""
+    from lumidock.evaluation.dead_lights import Approach, dead_sets, least_confusion_m, strength
+
+    dock = load_station(shipped_or_path("station", source))
+    lens = load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))
+    approach = Approach(from_z, min(float(dock.docking_point[2]), 0.0), speed, np.full(len(dock), reach))
+    judged = strength(dock, lens, Config(), approach, dead_sets(len(dock), dead))
+    rows = [
+        {"z_m": z, "ratio": float(judged.ratio[k]), "dead": [dock.ids[i] for i in judged.dead[int(judged.worst[k])]]}
+        for z in range(int(from_z), int(approach.to_z_m) - 1, -1)
+        for k in [int(np.abs(judged.z_m - z).argmin())]
+    ]
+    confusion = least_confusion_m(dock)
+    if as_json:
+        print(json.dumps({"worst": float(judged.ratio.max()), "approach": rows, "confusion_m": confusion}, indent=1))
+    else:
+        print(f"{'z, m':>6}  level over limit   worst with these dead")
+        for row in rows:
+            verdict = "" if float(str(row["ratio"])) < 1.0 else "NOT VALID"
+            print(f"{row['z_m']:6}  {row['ratio']:16.2f}   {', '.join(row['dead']) or 'none':16} {verdict}")
+        print(f"least confusion: {', '.join(f'{layer} {m:.3f} m' for layer, m in confusion.items())}")
+    if judged.ratio.max() >= 1.0:
+        raise typer.Exit(1)
