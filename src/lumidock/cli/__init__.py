@@ -15,7 +15,20 @@ import cv2
 import typer
 
 from lumidock.camera import load_camera
-from lumidock.cli import calibration, demo, doctoring, evaluation, exporting, inspection, reporting, serving, stations
+from lumidock.cli import (
+    calibration,
+    demo,
+    designing,
+    doctoring,
+    evaluation,
+    exporting,
+    inspection,
+    reporting,
+    serving,
+    setting_up,
+    stations,
+    water,
+)
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
@@ -72,7 +85,10 @@ _COMMANDS = (
     reporting,
     serving,
     calibration,
+    water,
     stations,
+    setting_up,
+    designing,
     demo,
     doctoring,
 )  # importing them adds their commands

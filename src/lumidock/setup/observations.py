@@ -1,0 +1,117 @@
+"""What a survey sees: which light was detected where, in the frames of one or more recordings of the same dock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from lumidock.camera import Camera
+from lumidock.config import Config
+from lumidock.datatypes import Array, Detections, Fix, Indices
+from lumidock.localizer import Localizer
+from lumidock.station import Station
+
+LEAST_LIGHTS = 4  # three lights fit up to four poses, so a frame with fewer than four says nothing of positions
+Progress = Callable[[int, int | None], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Identified lights in F frames; M lights.
+
+    `uv` (F, M, 2) px, NaN where a light was not detected; `sigma_px` (F, M) the 1-sigma error of each centre as the
+    detector states it, or as configured where it states none; `recording` (F,), `t_ns` (F,) and `frame` (F,) say when.
+    `share` is the part of the frames between the first and the last identified one of a recording that were identified.
+    """
+
+    uv: Array
+    sigma_px: Array
+    recording: Indices
+    t_ns: Indices
+    frame: tuple[str, ...]
+    share: float = 1.0
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Which lights (F, M) were detected."""
+        return np.asarray(np.isfinite(self.uv[..., 0]))
+
+    def take(self, frames: Indices) -> Self:
+        """The frames at these indices alone."""
+        return type(self)(
+            self.uv[frames],
+            self.sigma_px[frames],
+            self.recording[frames],
+            self.t_ns[frames],
+            tuple(self.frame[i] for i in frames),
+            self.share,
+        )
+
+    def without(self, rejected: np.ndarray) -> Self:
+        """The same without the detections where `rejected` (F, M)."""
+        uv = np.where(rejected[..., None], np.nan, self.uv)
+        return type(self)(uv, self.sigma_px, self.recording, self.t_ns, self.frame, self.share)
+
+
+def identify(
+    recordings: Sequence[Iterable[Detections]],
+    station: Station,
+    camera: Camera,
+    config: Config,
+    progress: Progress | None = None,
+) -> Observations:
+    """Associate the detections of each recording with the lights of `station`, as the localizer does.
+
+    The station's declared sigmas decide how far a light may lie from where the file has it. Frames in which fewer than
+    four lights are identified are left out.
+    """
+    rows: list[_Row | None] = []
+    done = spans = 0
+    for number, recording in enumerate(recordings):
+        localizer, first = Localizer(station, camera, config), len(rows)
+        for detections in recording:
+            rows.append(_row(number, localizer.process_detections(detections), len(station), config.match.noise_px))
+            done += 1
+            if progress is not None:
+                progress(done, None)
+        found = [k for k, row in enumerate(rows[first:]) if row is not None]
+        spans += found[-1] - found[0] + 1 if found else 0
+    kept = [row for row in rows if row is not None]
+    if not kept:
+        m = len(station)
+        return Observations(np.empty((0, m, 2)), np.empty((0, m)), *(np.empty(0, np.int64),) * 2, ())
+    return Observations(
+        np.array([row.uv for row in kept]),
+        np.array([row.sigma_px for row in kept]),
+        np.array([row.recording for row in kept], np.int64),
+        np.array([row.t_ns for row in kept], np.int64),
+        tuple(row.frame for row in kept),
+        len(kept) / spans,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Row:
+    uv: Array
+    sigma_px: Array
+    recording: int
+    t_ns: int
+    frame: str
+
+
+def _row(recording: int, fix: Fix, m: int, noise_px: float) -> _Row | None:
+    if fix.match is None or (fix.match.light >= 0).sum() < LEAST_LIGHTS:
+        return None
+    light, d = fix.match.light, fix.match.detections
+    used = light >= 0
+    uv, sigma = np.full((m, 2), np.nan), np.full(m, noise_px)
+    uv[light[used]] = d.uv[used]
+    if d.cov_px2 is not None:
+        sigma[light[used]] = np.sqrt(0.5 * np.trace(d.cov_px2[used], axis1=1, axis2=2))
+    return _Row(uv, sigma, recording, d.t_ns, d.frame)
