@@ -55,8 +55,8 @@ def test_prediction_covariance_agrees_with_sampling(rng):
 
 
 @pytest.mark.parametrize("z", [4.0, 9.0, 18.0])
-@pytest.mark.parametrize(("missing", "strays"), [(0, 0), (3, 0), (2, 3), (3, 5), (4, 0)])
-def test_history_names_the_lights_that_are_left(rng, z, missing, spurious):
+@pytest.mark.parametrize(("missing", "spurious"), [(0, 0), (3, 0), (2, 3), (3, 5), (4, 0)])
+def test_history_identifies_the_lights_that_are_left(rng, z, missing, spurious):
     for _ in range(4):
         T_dock_cam, predicted = moving(rng, z + 1.65)
         true = np.concatenate([rng.permutation(7)[missing:], np.full(spurious, -1)])

@@ -237,7 +237,7 @@ def _fit_arc(outline: Array, size: tuple[int, int], config: ExtractConfig) -> tu
 
 
 def _stands_out(blob: _Blob, gray: Image, config: ExtractConfig) -> bool:
-    """Whether a small spot's peak clears the noise of the ring around it; large ones were judged by their shape."""
+    """Whether the peak of a small blob clears the noise around it; large ones were judged by their shape."""
     if np.pi * blob.radius**2 >= config.small_area_px:
         return True
     u, v, reach = round(blob.u), round(blob.v), int(1.5 * blob.radius) + 4
@@ -250,7 +250,7 @@ def _stands_out(blob: _Blob, gray: Image, config: ExtractConfig) -> bool:
 
 
 def _centroid(weights: Array) -> Array:
-    """Centre (2,) of a spot too small for a circle, weighted by its grey levels."""
+    """Centroid (2,) of a blob too small for a circle, weighted by its grey levels."""
     rows, columns = np.indices(weights.shape)
     return np.asarray([(weights * columns).sum(), (weights * rows).sum()] / weights.sum())
 
