@@ -1,0 +1,42 @@
+"""A matcher of one's own: detections and lights of the front layer, each in their order around the centre.
+
+pip install examples/own_method, and then: lumidock run SOURCE --method polar-order --out RUN
+"""
+
+import numpy as np
+
+from lumidock import Camera, Config, Detections, Fix, Frame, Station, solve_pose
+from lumidock.detect import lights
+
+
+class PolarOrder:
+    """As many detections as the front layer has lights, matched in their order around the centre."""
+
+    def __init__(self, station: Station, camera: Camera, config: Config, *, cold: bool = False) -> None:  # noqa: ARG002
+        self.station, self.camera, self.config = station, camera, config
+        front = station.lights_of(station.layers_front_to_rear()[0])
+        self.lights = front[np.argsort(angle(station.p_dock[front, :2] * [1, -1]))]  # pixels have y down
+
+    def process(self, frame: Frame) -> Fix:
+        """Fix of one frame, by the detector of lumidock."""
+        return self.process_detections(lights(frame, self.config.detect))
+
+    def process_detections(self, detections: Detections) -> Fix:
+        """Fix of one frame's detections."""
+        front = np.flatnonzero((detections.p_light > 0.5) & ~(detections.p_rear > 0.5))
+        if len(front) != len(self.lights):
+            return Fix(detections.frame, detections.t_ns, "none", "search", reason="too_few")
+        uv = detections.uv[front[np.argsort(angle(detections.uv[front]))]]
+        turns = [solve_pose(self.station, self.camera, np.roll(self.lights, k), uv) for k in range(len(uv))]
+        best = min((poses[0] for poses in turns if poses), key=lambda pose: pose.chi2, default=None)
+        if best is None or best.chi2 > 40.0:  # of 14 coordinates; 1 frame in 10,000 has more
+            return Fix(detections.frame, detections.t_ns, "none", "search", reason="inconsistent")
+        return Fix(detections.frame, detections.t_ns, "acquired", "front", len(detections), len(uv), best.T_dock_cam)
+
+    def forget(self) -> None:
+        """Nothing is remembered."""
+
+
+def angle(xy: np.ndarray) -> np.ndarray:
+    """Angle (N,) of points (N, 2) around their mean."""
+    return np.arctan2(*(xy - xy.mean(axis=0)).T[::-1])
