@@ -6,6 +6,7 @@ pip install examples/own_method, and then: lumidock run SOURCE --method polar-or
 import numpy as np
 
 from lumidock import Camera, Config, Detections, Fix, Frame, Station, solve_pose
+from lumidock.datatypes import Match
 from lumidock.detect import lights
 
 
@@ -26,12 +27,24 @@ class PolarOrder:
         front = np.flatnonzero((detections.p_light > 0.5) & ~(detections.p_rear > 0.5))
         if len(front) != len(self.lights):
             return Fix(detections.frame, detections.t_ns, "none", "search", reason="too_few")
-        uv = detections.uv[front[np.argsort(angle(detections.uv[front]))]]
-        turns = [solve_pose(self.station, self.camera, np.roll(self.lights, k), uv) for k in range(len(uv))]
-        best = min((poses[0] for poses in turns if poses), key=lambda pose: pose.chi2, default=None)
-        if best is None or best.chi2 > 40.0:  # of 14 coordinates; 1 frame in 10,000 has more
+        order = front[np.argsort(angle(detections.uv[front]))]
+        turns = [np.roll(self.lights, k) for k in range(len(order))]
+        solved = [(solve_pose(self.station, self.camera, turn, detections.uv[order]), turn) for turn in turns]
+        best, turn = min(((poses[0], turn) for poses, turn in solved if poses), key=lambda pair: pair[0].chi2)
+        if best.chi2 > 40.0:  # of 14 coordinates; 1 frame in 10,000 has more
             return Fix(detections.frame, detections.t_ns, "none", "search", reason="inconsistent")
-        return Fix(detections.frame, detections.t_ns, "acquired", "front", len(detections), len(uv), best.T_dock_cam)
+        light = np.full(len(detections), -1)
+        light[order] = turn
+        return Fix(
+            detections.frame,
+            detections.t_ns,
+            "acquired",
+            "front",
+            len(detections),
+            len(order),
+            best.T_dock_cam,
+            match=Match(detections, light),
+        )
 
     def forget(self) -> None:
         """Nothing is remembered."""

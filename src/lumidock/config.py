@@ -104,7 +104,7 @@ class BtekfConfig(Section):
     gate: PositiveFloat = 13.8  # M^2 of eq. (12): chi-square, 2 dof, 99.9 %
     pixel_sigma: PositiveFloat = 1.0  # px, R of eq. (13)
     accept_px: PositiveFloat = 4.0  # reprojection residual after an update
-    # section 3.2.3 e as printed: the filter's own pose is the answer of its frame, and the next frame is associated with
+    # section 3.2.3 e as printed: the filter's own pose is the answer of its frame, and the next frame is associated by
     # the lights reprojected from it; otherwise SQPnP solves every frame, and the swarm opens the next one
     pose_from_filter: bool = False
     min_lights: Annotated[int, Field(ge=3)] = 3  # section 3.2.3 e

@@ -31,7 +31,13 @@ def pictures(view: RunView, most: int) -> list[Picture]:
     """At most `most` annotated pictures, in the order of the run; none where the source has no frames at hand."""
     if view.source is None or view.source.kind == "detections" or not most:
         return []
-    wanted = dict(sorted(_moments(view)[:most]))
+    return pictures_of(view, dict(sorted(_moments(view)[:most])))
+
+
+def pictures_of(view: RunView, wanted: dict[int, str]) -> list[Picture]:
+    """Annotated pictures of the frames `wanted`, by their number, with their titles."""
+    if view.source is None or view.source.kind == "detections":
+        return []
     return [_picture(view, view.fixes[k], developed(item), title) for k, title, item in _items(view, wanted)]
 
 

@@ -12,9 +12,14 @@ class Grid:
     """What is computed; seeds are consecutive from `first_seed`, and the same grid gives the same numbers."""
 
     name: str
-    trials: int  # of a row of Table 1
+    trials: int  # of a row of Table 1, on the dock as given
+    layout_trials: int  # the same, on the other layouts
     trials_a_job: int
-    draws: int  # poses at each distance, and of each cold start
+    table_interval_s: float  # between the rendered frames of Table 1
+    ablation_trials: int  # of each change, and of each size of the swarm
+    draws: int  # poses at each distance, and of each acquisition
+    compared: int  # frames of each condition that all baselines see
+    extraction_frames: int  # at each distance, in each water
     dockings: int  # rendered approaches
     docking_interval_s: float
     search_interval_s: float
@@ -31,9 +36,14 @@ class Grid:
 
 QUICK = Grid(
     name="quick",
-    trials=6,
-    trials_a_job=3,
+    trials=5,
+    layout_trials=2,
+    trials_a_job=1,
+    table_interval_s=1.0,
+    ablation_trials=2,
     draws=100,
+    compared=60,
+    extraction_frames=2,
     dockings=1,
     docking_interval_s=0.15,
     search_interval_s=1.0,
@@ -49,8 +59,13 @@ QUICK = Grid(
 FULL = Grid(
     name="full",
     trials=30,
+    layout_trials=30,
     trials_a_job=2,
+    table_interval_s=0.15,
+    ablation_trials=30,
     draws=1000,
+    compared=500,
+    extraction_frames=10,
     dockings=3,
     docking_interval_s=0.15,
     search_interval_s=0.5,
