@@ -7,8 +7,18 @@ import numpy as np
 import pytest
 from bench.shipped import shipped_camera, shipped_station
 
-from lumidock.baselines import ASSOCIATIONS, BaselineLocalizer, cpd, hungarian, neighbours, p3p, plain_pso, pnp, ransac
-from lumidock.baselines import vote
+from lumidock.baselines import (
+    ASSOCIATIONS,
+    BaselineLocalizer,
+    cpd,
+    hungarian,
+    neighbours,
+    p3p,
+    plain_pso,
+    pnp,
+    ransac,
+    vote,
+)
 from lumidock.baselines.view import view_of
 from lumidock.config import Config
 from lumidock.datatypes import Detections
@@ -57,7 +67,7 @@ def test_p3p_finds_the_true_pose_among_at_most_four(rng):
 
 
 def test_every_p3p_solution_reprojects_onto_its_three_rays(rng):
-    p_dock, ray = rng.uniform(-1, 1, (500, 3, 3)), rng.normal(0, 0.3, (500, 3, 3)) + [0, 0, 1]
+    p_dock, ray = rng.uniform(-1, 1, (500, 3, 3)), rng.normal(0, 0.3, (500, 3, 3)) + np.array([0, 0, 1])
     ray /= np.linalg.norm(ray, axis=2, keepdims=True)
     poses = p3p.solve(ray, p_dock)
     assert len(poses) > 100

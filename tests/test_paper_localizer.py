@@ -17,6 +17,7 @@ from lumidock.geometry import se3_inverse, so3_log
 from lumidock.paper import PaperLocalizer
 from lumidock.pose import project_lights
 from lumidock.reproduce.paper_figures import TABLE_1
+from lumidock.reproduce.trials import Condition, merged
 from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import Scenario, load_scenario
 from lumidock.sim.sequence import render_frame
@@ -211,23 +212,26 @@ def test_process_finds_both_layers(rng):
     assert mono.n_seen == 13
 
 
-@pytest.mark.parametrize(("missing", "spurious"), list(TABLE_1))
-def test_table_1_holds_on_a_few_trials(missing, spurious):
-    counts = sum((table1.trial(missing, spurious, seed) for seed in (900, 901, 902)), table1.Counts())
-    wanted = {(3, 0): 90.3, (2, 0): 98.6, (1, 0): 99.9, (0, 1): 99.6, (0, 2): 99.6}[missing, spurious]
-    assert counts.frames > 190
-    assert 100.0 * counts.swarm_right / counts.frames >= wanted - 0.5  # one frame in 200
-    assert counts.right == counts.frames
-    assert counts.wrong == 0
+SWARM_PERCENT = {(3, 0): 90.3, (2, 0): 98.6, (1, 0): 99.9, (0, 1): 99.6, (0, 2): 99.6}
+
+
+@pytest.mark.parametrize("faults", list(TABLE_1))
+def test_table_1_holds_on_a_few_trials(faults):
+    counts = merged(table1.trial(Condition(*faults), seed) for seed in (900, 901, 902))["30 m"]
+    swarm, whole = (counts[name] for name in table1.METHODS)
+    assert swarm.frames > 190
+    assert 100.0 * swarm.right / swarm.frames >= SWARM_PERCENT[faults] - 0.5  # one frame in 200
+    assert whole.right == whole.frames
+    assert whole.wrong == 0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("missing", "spurious"), list(TABLE_1))
-def test_table_1_holds_on_thirty_trials(missing, spurious):
-    counts = table1.condition(missing, spurious, first_seed=40_000)
-    wanted = {(3, 0): 90.3, (2, 0): 98.6, (1, 0): 99.9, (0, 1): 99.6, (0, 2): 99.6}[missing, spurious]
-    assert 100.0 * counts.swarm_right / counts.frames >= wanted
-    assert 100.0 * counts.right / counts.frames >= 99.9
+@pytest.mark.parametrize("faults", list(TABLE_1))
+def test_table_1_holds_on_thirty_trials(faults):
+    counts = table1.counts_of(Condition(*faults), first_seed=40_000)
+    swarm, whole = (counts[name] for name in table1.METHODS)
+    assert 100.0 * swarm.right / swarm.frames >= SWARM_PERCENT[faults]
+    assert 100.0 * whole.right / whole.frames >= 99.9
 
 
 def check_approach(result):
@@ -290,7 +294,7 @@ def test_preset_fills_in_what_is_not_given_and_the_resolved_values_are_saved():
         (0.5, 8.0),
         (-1.0, 1.0),
     )
-    assert not (PRINTED.btekf.noise_in_gate or PRINTED.btekf.missing_branch)
+    assert (PRINTED.btekf.noise_in_gate, PRINTED.btekf.missing_branch) == (False, False)
     own = PaperConfig.model_validate({"preset": "as_printed", "pso": {"particles": 33}, "btekf": {"gate": 9.2}})
     assert (own.pso.particles, own.pso.iterations, own.btekf.gate, own.btekf.noise_in_gate) == (33, 40, 9.2, False)
     assert PaperConfig.model_validate(own.model_dump(mode="json")) == own

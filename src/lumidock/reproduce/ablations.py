@@ -58,10 +58,8 @@ CLEAN_FRAMES = 4
 SIZES = ((10, 20), (20, 20), (20, 40), (40, 40), (40, 80), (80, 80), (80, 120), (160, 160))
 _TEXT = (
     "One setting changed at a time, on the trials of Table 1 with history; the last condition begins after four clean "
-    "frames, "
-    "since one-to-one assignment cannot begin with it. Per cent of the frames right with the 95 % interval, and the "
-    "frames "
-    "with a wrong identity. Colour and radius do not enter here: only the front layer is in sight."
+    "frames, since one-to-one assignment cannot begin with it. Per cent of the frames right with the 95 % interval, "
+    "and the frames with a wrong identity. Colour and radius do not enter here: only the front layer is in sight."
 )
 
 

@@ -37,20 +37,15 @@ FAULTS = ((1, 0), (2, 0), (3, 0), (0, 1), (0, 2))
 _WIDTH_PX, _QUALITY = 480, 80  # of a picture on the page
 _MARGIN_PX = 60  # around the lights that are shown
 _TEXT = (
-    "The paper's figures 9 and 10 show single frames at 9, 5 and 3 m with one to three front lights dark, and with one "
-    "or "
-    "two spurious ones; no numbers. Here a rendered frame of each, as its method in the recommended preset associates "
-    "it "
-    "without history (rings: identified lights; red rings: detections that were given no light), and below how often "
-    "each "
-    "method is right over many independent frames at point level."
+    "The paper's figures 9 and 10 show single frames at 9, 5 and 3 m with one to three front lights dark, and with "
+    "one or two spurious ones; no numbers. Here a rendered frame of each, as its method in the recommended preset "
+    "associates it without history (rings: identified lights; red rings: detections that were given no light), and "
+    "below how often each method is right over many independent frames at point level."
 )
 _FILTER_TEXT = (
     "Figure 7 shows a light missing and a noisy point; figure 11 two frames one after the other: first a spurious "
-    "light "
-    "appears, then a true one goes dark while it stays. One-to-one assignment has to give the spurious detection the "
-    "place "
-    "of the missing light; the filter, which knows where the lights must be, does not."
+    "light appears, then a true one goes dark while it stays. One-to-one assignment has to give the spurious "
+    "detection the place of the missing light; the filter, which knows where the lights must be, does not."
 )
 
 
@@ -235,8 +230,8 @@ def _word(found: list[bool]) -> str:
 def _figure_7(result: dict[str, Any]) -> Plot:
     caption = (
         "Figure 7, pixels: one front light is dark and one detection is spurious (red). Crosses: where the filter "
-        "expects "
-        "the lights. Left the association by the swarm alone, right that of the filter; amber where it is wrong."
+        "expects the lights. Left the association by the swarm alone, right that of the filter; amber where it is "
+        "wrong."
     )
     last = result["rows"][-1]
     shown = [("swarm alone", result["swarm"]), ("backtracking filter", result["filter"])]
@@ -251,7 +246,8 @@ def _figure_7(result: dict[str, Any]) -> Plot:
 def _figure_11(result: dict[str, Any]) -> Plot:
     caption = (
         "Figure 11: above, a spurious light appears (red); below, a true one goes dark and it stays. As printed, "
-        "recommended and lumidock, each with the frames before; amber where an identity is wrong or missing."
+        "recommended and lumidock, each with the frames before; amber where an identity is wrong or missing. Crosses: "
+        "where the filter of the recommended preset expects the lights of the second frame."
     )
     rows = result["rows"][-2:]
     shown = [

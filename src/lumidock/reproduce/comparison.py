@@ -48,11 +48,10 @@ _TILT_DEG = 3.0  # largest pitch, yaw and roll, as in section 4.1
 _TURNED_DEG = 5.0  # a rotation error beyond this is the other pose of the plane
 _TEXT = (
     "Independent frames without history, between 3 and 19 m, all methods on the same detections. Right: every "
-    "detection as "
-    "it should be; wrong: some identity is not its own; the rest is refused or partial. Hazardous: a pose is given "
-    "whose "
-    "error is over the alert limit at its distance, whatever its identities; of lumidock only valid poses count. Each "
-    "baseline is written from its paper and reproduces a property that the paper states, as a test of this package."
+    "detection as it should be; wrong: some identity is not its own; the rest is refused or partial. Hazardous: a "
+    "pose is given whose error is over the alert limit at its distance, whatever its identities; of lumidock only "
+    "valid poses count. Each baseline is written from its paper and reproduces a property that the paper states, as a "
+    "test of this package."
 )
 
 
@@ -197,8 +196,7 @@ def _condition(key: str) -> str:
 def _plot(totals: Mapping[str, list[int]]) -> Plot:
     caption = (
         "All conditions together, share of the frames: right (green), wrong (red) and hazardous poses (hatched over "
-        "it); "
-        "the rest is refused or partial."
+        "it); the rest is refused or partial."
     )
     height = 0.8 + 0.36 * len(totals)
     frames = max(sum(counts[:3]) for counts in totals.values())
@@ -252,7 +250,6 @@ def _solver_table(results: Results) -> Table:
     ]
     caption = (
         f"PnP solvers with identified lights and {_NOISE_PX:g} px of noise. IPPE is for planes only. OpenCV's EPnP has "
-        f"no "
-        "case for planes and returns the other pose of the plane in part of the frames."
+        "no case for planes and returns the other pose of the plane in part of the frames."
     )
     return Table(caption, head, rows)

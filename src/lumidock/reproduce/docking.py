@@ -31,10 +31,9 @@ _FOUR = 4  # lights of a layer that give a pose by it alone
 _NOT_COMPARABLE = "gives none"
 _TEXT = (
     "The paper's trial in a pool, 30 m to the docking plane at z = -3 m at 1 m/s with a frame every 0.15 s; here "
-    "rendered in "
-    "Jerlov III water at 2 ms of exposure. Its figure 15 shows associations on single frames, figure 16 the position "
-    "over "
-    "time, solid by the front lights and dashed by the rear lights. The paper has no ground truth; here there is one."
+    "rendered in Jerlov III water at 2 ms of exposure. Its figure 15 shows associations on single frames, figure 16 "
+    "the position over time, solid by the front lights and dashed by the rear lights. The paper has no ground truth; "
+    "here there is one."
 )
 
 
@@ -129,10 +128,8 @@ def layer_positions(view: RunView, layer: str) -> Array:
 def _figure_16(view: RunView, name: str) -> Plot:
     caption = (
         f"Figure 16, {title(name)}: position over time by the identified lights of each layer alone (SQPnP), solid "
-        f"amber by "
-        "the front layer, dashed blue by the rear layer; thin line the truth. The paper's front layer reaches from "
-        "18.62 to "
-        "1.73 m, its rear layer begins at 10.07 m, and the two agree within 0.3 m."
+        "amber by the front layer, dashed blue by the rear layer; thin line the truth. The paper's front layer "
+        "reaches from 18.62 to 1.73 m, its rear layer begins at 10.07 m, and the two agree within 0.3 m."
     )
     return plot(f"figure-16-{name}", caption, lambda f, _narrow: _draw_figure_16(f, view), (4.6, 6.0))
 

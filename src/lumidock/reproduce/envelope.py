@@ -24,10 +24,8 @@ METHODS = ("paper", "lumidock")
 _APPROACH_M, _FRAME_S = 33.0, 0.3
 _TEXT = (
     "The paper leaves turbidity, salinity and illumination to future work. Approaches rendered for each water and "
-    "exposure: "
-    "true z of the first and the last frame that could be used. Our method by bearing and range (guide) and by full "
-    "pose "
-    "(valid); the paper's by its pose, which comes without a protection level."
+    "exposure: true z of the first and the last frame that could be used. Our method by bearing and range (guide) and "
+    "by full pose (valid); the paper's by its pose, which comes without a protection level."
 )
 
 

@@ -45,13 +45,10 @@ _FOUND_PX = 4.0  # a detection so near to a light is that light; at least, its o
 _LIKELY = 0.5  # lamp probability below which a detection of ours is not counted as one
 _TEXT = (
     "Rendered frames at 18, 12, 8 and 4 m. Found: share of the lights in view that have a detection within 4 px (or "
-    "its own "
-    "radius). The paper converts to gray without saying how; luma, the usual way, weighs blue by 0.114. It judges "
-    "regions by "
-    "roundness and compactness; of a few pixels these measures say little, so regions below 40 px skip them unless it "
-    "is "
-    "said. The paper leaves turbidity, salinity and illumination to future work: the curves below are of the detectors "
-    "alone."
+    "its own radius). The paper converts to gray without saying how; luma, the usual way, weighs blue by 0.114. It "
+    "judges regions by roundness and compactness; of a few pixels these measures say little, so regions below 40 px "
+    "skip them unless it is said. The paper leaves turbidity, salinity and illumination to future work: the curves "
+    "below are of the detectors alone."
 )
 
 

@@ -17,12 +17,9 @@ _METHODS = ("lumidock",)
 _APPROACH_M, _FRAME_S, _ALL_INTERVAL_S = 33.0, 0.25, 0.15
 _TEXT = (
     "Every shipped docking: frames that claim to be usable while their error is over the alert limit. Point level: "
-    "bare "
-    "detections that are missed, err and are false as measured on rendered frames of the scenario's water and lights, "
-    "drawn "
-    "anew in each frame and false ones anywhere in the picture; mirror images and glints that stand where a light "
-    "might, and "
-    "errors that last, are only in the rendered rows."
+    "bare detections that are missed, err and are false as measured on rendered frames of the scenario's water and "
+    "lights, drawn anew in each frame and false ones anywhere in the picture; mirror images and glints that stand "
+    "where a light might, and errors that last, are only in the rendered rows."
 )
 
 

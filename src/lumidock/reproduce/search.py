@@ -30,14 +30,10 @@ _FLIPPED_DEG = 5.0  # a rotation error beyond this is the other pose of the plan
 _FRAME_S = 0.35
 _TEXT = (
     "Once round a rectangle at 15 m, looking straight along the dock's axis, so that the dock is seen from below, "
-    "left, "
-    "above and right, and in part. The paper shows one picture of each side, and a trajectory that follows the path. "
-    "Its "
-    "rectangle is not given; this one, 15.2 x 12.4 m, keeps four front lights or more in view on every side. All "
-    "frames "
-    "are counted. The paper's method answers with a pose; lumidock with a pose where its protection level allows one, "
-    "and "
-    "else with bearing and range, which place no point."
+    "left, above and right, and in part. The paper shows one picture of each side, and a trajectory that follows the "
+    "path. Its rectangle is not given; this one, 15.2 x 12.4 m, keeps four front lights or more in view on every "
+    "side. All frames are counted. The paper's method answers with a pose; lumidock with a pose where its protection "
+    "level allows one, and else with bearing and range, which place no point."
 )
 
 
@@ -146,8 +142,7 @@ def _pictures(folder: Path, views: list[RunView]) -> list[Picture]:
 def _figure_13(views: list[RunView]) -> Plot:
     caption = (
         "Figure 13: the path (line) and the poses (points) in the plane at 15 m, x to the right and y up, metres, by "
-        "each "
-        "method; stars are the dock's lights."
+        "each method; stars are the dock's lights."
     )
     return plot("search", caption, lambda f, narrow: _draw(f, narrow, views), (3.6, 3.7 * len(views)))
 

@@ -44,10 +44,8 @@ def section(results: Results) -> Section:
 
 _TEXT = (
     "Marks: ✓ better than the paper's figure, ≈ no difference that its number of frames or ours could show, ✗ worse. "
-    "Of shares "
-    "both 95 % intervals are compared; the paper's is of the 2076 to 2153 frames that it counts. Other figures of the "
-    "paper are "
-    "of one run, and are met (✓) or not (✗)."
+    "Of shares both 95 % intervals are compared; the paper's is of the 2076 to 2153 frames that it counts. Other "
+    "figures of the paper are of one run, and are met (✓) or not (✗)."
 )
 
 

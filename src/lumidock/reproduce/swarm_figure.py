@@ -26,10 +26,8 @@ _NEAR_M = 9.0  # the first frame nearer than this is shown
 _SHARES = (0.0, 0.1, 0.3, 1.0)  # of the iterations
 _TEXT = (
     "The paper's figure 6 shows its particles in tx, ty and theta, coloured by scale, gathering over the iterations, "
-    "with "
-    "the registered points beside. The same here, on a frame with one front light missing: above each row the share of "
-    "the "
-    "iterations that have passed. The paper does not say how many particles or iterations it drew."
+    "with the registered points beside. The same here, on a frame with one front light missing. The paper does not "
+    "say how many particles or iterations it drew."
 )
 
 
@@ -55,6 +53,7 @@ def trace(dock: Dock, config: Config, seed: int) -> dict[str, Any]:
         result[name] = {
             "iterations": shown,
             "particles": steps[shown].round(4).tolist(),
+            "reach": paper.pso.shift[1],
             "best": np.minimum.accumulate(steps[:, :, 4].min(axis=1)).tolist(),
             "mean": steps[:, :, 4].mean(axis=1).tolist(),
             "lights": normalize(lights_xy).points.tolist(),
@@ -77,8 +76,7 @@ def _particles(result: dict[str, Any], name: str) -> Plot:
     caption = (
         f"{count} particles, {len(one['best'])} iterations ({name}), {result['detections']} detections from z = "
         f"{result['z_m']:.1f} m: tx, ty and theta (degrees), coloured by scale from dark (small) to light. Last panel: "
-        f"the "
-        f"lights (rings) and where the best transform puts the detections (crosses); {one['right']} of "
+        f"the lights (rings) and where the best transform puts the detections (crosses); {one['right']} of "
         f"{result['detections']} identities are right."
     )
     return plot(f"swarm-{name.replace(' ', '-')}", caption, lambda f, narrow: _draw(f, narrow, one), (3.1, 9.0))
@@ -87,12 +85,12 @@ def _particles(result: dict[str, Any], name: str) -> Plot:
 def _draw(figure: Figure, narrow: bool, one: dict[str, Any]) -> None:
     panels = len(one["particles"]) + 1
     rows, columns = (-(-panels // 2), 2) if narrow else (1, panels)
-    scales = np.array(one["particles"])[..., 1]
+    scales, reach = np.array(one["particles"])[..., 1], (-one["reach"], one["reach"])
     for k, (iteration, particles) in enumerate(zip(one["iterations"], one["particles"], strict=True)):
         axes: Any = figure.add_subplot(rows, columns, k + 1, projection="3d")
         theta, s, tx, ty, _ = np.array(particles).T
         axes.scatter(tx, ty, np.rad2deg(theta), c=s, s=9, cmap="viridis", vmin=0.0, vmax=scales.max(), depthshade=False)
-        axes.set(title=f"iteration {iteration + 1}", xlabel="tx", ylabel="ty", zlim=(-10, 10))
+        axes.set(title=f"iteration {iteration + 1}", xlabel="tx", ylabel="ty", zlim=(-10, 10), xlim=reach, ylim=reach)
         axes.tick_params(labelsize=6, pad=-2)
         for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
             axis.set_pane_color((0.5, 0.5, 0.5, 0.06))

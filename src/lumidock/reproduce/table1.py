@@ -39,15 +39,12 @@ ROWS = (*((*faults, False) for faults in TABLE_1), (1, 1, False), (1, 1, True), 
 SMALL, LARGE = "20 x 40, printed bounds", "80 x 120, wide bounds"
 _SAME_PX = 4.0  # a detection so near to the projection of a light is that light; at least, its own radius
 _TEXT = (
-    "The paper's section 4.1 at point level: centroids with 0.5 px of noise, runs toward the dock at 1.5 m/s and 4 Hz. "
-    "A frame counts when all seven front lights are in view. It is right when every true detection carries the "
-    "identity "
-    "of its own light and no spurious one carries any, and wrong when any identity is not so; the rest has no answer, "
-    "or "
-    "a partial one. The swarm stands alone, without filter; a swarm with history uses eqs. (7) and (8). Per cent with "
-    "the 95 % interval (Wilson), and the frames with a wrong identity. The paper gives neither the size of its swarm "
-    "nor "
-    "where its trials begin, so both are varied."
+    "The paper's section 4.1 at point level: centroids with 0.5 px of noise, runs toward the dock at 1.5 m/s and 4 "
+    "Hz. A frame counts when all seven front lights are in view. It is right when every true detection carries the "
+    "identity of its own light and no spurious one carries any, and wrong when any identity is not so; the rest has "
+    "no answer, or a partial one. The swarm stands alone, without filter; a swarm with history uses eqs. (7) and (8). "
+    "Per cent with the 95 % interval (Wilson), and the frames with a wrong identity. The paper gives neither the size "
+    "of its swarm nor where its trials begin, so both are varied."
 )
 
 
@@ -123,7 +120,7 @@ def counted(results: Results, condition: Condition) -> Counts:
 
 
 def count_rendered(simulation: Simulation, methods: Methods, config: Config) -> dict[str, Any]:
-    """The methods with history on rendered frames: the front lights that were detected, and whose they are said to be."""
+    """The methods with history on rendered frames, judged on the front lights that each one detected."""
     scenario, station, camera = simulation.load()
     t_ns, poses = trajectory(scenario, np.random.default_rng([simulation.seed, 0]))
     paths = np.random.default_rng([simulation.seed, 2])
@@ -218,8 +215,7 @@ def _rendered_table(plan: Plan, results: Results) -> Table:
         rows.append([Condition(missing, spurious).name, str(frames), *cells])
     caption = (
         "Rendered frames from 18.6 to 3 m in Jerlov III water, each method with its own detector and with history: "
-        "right "
-        "where every front light that the detector found is identified and nothing wrongly. A frame in which a method "
-        "lists no detections is not counted for it."
+        "right where every front light that the detector found is identified and nothing wrongly. A frame in which a "
+        "method lists no detections is not counted for it."
     )
     return Table(caption, ["condition", "frames", *(f"{title(name)}, %" for name in plan.methods)], rows)
