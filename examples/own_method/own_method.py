@@ -3,6 +3,8 @@
 pip install examples/own_method, and then: lumidock run SOURCE --method polar-order --out RUN
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from lumidock import Camera, Config, Detections, Fix, Frame, Station, solve_pose
@@ -25,26 +27,17 @@ class PolarOrder:
     def process_detections(self, detections: Detections) -> Fix:
         """Fix of one frame's detections."""
         front = np.flatnonzero((detections.p_light > 0.5) & ~(detections.p_rear > 0.5))
-        if len(front) != len(self.lights):
-            return Fix(detections.frame, detections.t_ns, "none", "search", reason="too_few")
         order = front[np.argsort(angle(detections.uv[front]))]
-        turns = [np.roll(self.lights, k) for k in range(len(order))]
+        turns = [np.roll(self.lights, k) for k in range(len(order)) if len(order) == len(self.lights)]
         solved = [(solve_pose(self.station, self.camera, turn, detections.uv[order]), turn) for turn in turns]
-        best, turn = min(((poses[0], turn) for poses, turn in solved if poses), key=lambda pair: pair[0].chi2)
-        if best.chi2 > 40.0:  # of 14 coordinates; 1 frame in 10,000 has more
+        fits = [(poses[0], turn) for poses, turn in solved if poses and poses[0].chi2 < 40.0]  # of 14 coordinates
+        if not fits:
             return Fix(detections.frame, detections.t_ns, "none", "search", reason="inconsistent")
+        best, turn = min(fits, key=lambda fit: fit[0].chi2)
         light = np.full(len(detections), -1)
         light[order] = turn
-        return Fix(
-            detections.frame,
-            detections.t_ns,
-            "acquired",
-            "front",
-            len(detections),
-            len(order),
-            best.T_dock_cam,
-            match=Match(detections, light),
-        )
+        fix = Fix(detections.frame, detections.t_ns, "acquired", "front", T_dock_cam=best.T_dock_cam)
+        return replace(fix, n_seen=len(light), n_used=len(turn), match=Match(detections, light))
 
     def forget(self) -> None:
         """Nothing is remembered."""

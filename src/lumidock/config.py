@@ -33,7 +33,7 @@ class Section(BaseModel):
 class ExtractConfig(Section):
     """Light extraction, paper section 3.1.1."""
 
-    gray: Literal["max", "luma"] = "max"  # luma weighs blue by 0.114 and loses the rear layer
+    gray: Literal["max", "luma"] = "max"  # the paper says only "grayscale"; luma weighs blue by 0.114
     contrast: PositiveFloat = 5.0  # sigmas of the background that a threshold, or a blob's peak, must clear ...
     max_foreground: Fraction = 0.02  # ... with no more than this share of the frame as foreground
     min_step: PositiveFloat = 4.0  # grey levels above the background mode below which nothing is a light
@@ -125,6 +125,7 @@ class PoseConfig(Section):
 
 # What `preset: as_printed` changes of the defaults; docs/paper-method.md gives the reason and the effect of each.
 AS_PRINTED: dict[str, dict[str, Any]] = {
+    "extract": {"gray": "luma"},
     "layers": {"method": "color_or_radius"},
     "pso": {"particles": 20, "iterations": 40, "scale": (0.5, 8.0), "shift": (-1.0, 1.0)},
     "btekf": {

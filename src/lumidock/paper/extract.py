@@ -59,7 +59,8 @@ def lights(frame: Frame, config: ExtractConfig) -> Detections:
     columns = np.array([[s.u, s.v, s.radius, s.flux] for s in blobs]).reshape(-1, 4)
     unknown = np.full(len(blobs), np.nan)
     uv, radius_px, flux = columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy()
-    return Detections(frame.name, frame.t_ns, uv, radius_px, flux, np.ones(len(blobs)), unknown)
+    likely = np.ones(len(blobs))
+    return Detections(frame.name, frame.t_ns, uv, radius_px, flux, p_light=likely, p_rear=unknown)
 
 
 def _separated(gray: Image, config: ExtractConfig) -> tuple[int, int, Image, list[Array]]:

@@ -134,6 +134,8 @@ class LayerLocalizer:
 
     def _solve(self, t_ns: int, p_dock: Array, uv: Array, found: _Association) -> Array | None:
         """SQPnP; the filter's pose for three lights, which leave several solutions, or where section 3.2.3 e holds."""
+        if len(uv) < self.config.btekf.min_lights:
+            return None
         if found.track is not None and found.source == "btekf" and self.config.btekf.pose_from_filter:
             T_dock_cam: Array | None = found.track.T_dock_cam
         elif len(uv) >= MIN_FOR_SWARM:

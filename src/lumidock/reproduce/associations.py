@@ -79,7 +79,7 @@ def picture(dock: Dock, config: Config, z_m: float, faults: tuple[int, int], see
     uv = project_lights(camera, T_dock_cam, station.p_dock[front])
     low, high = uv.min(axis=0), uv.max(axis=0)
     spurious = rng.uniform(low, high, (faults[1], 2))
-    image, _, _ = render_frame(Scenario(), station, camera, T_dock_cam, spurious, dark, rng)
+    image, _, _ = render_frame(Scenario(), station, camera, T_dock_cam, spurious, dark=dark, rng=rng)
     method, settings = resolved("paper", config)
     fix = localizer_of(method, station, camera, settings, cold=True).process(Frame("0", 0, image))
     return _drawn(image, fix, station) | {"dark": [station.ids[i] for i in sorted(dark.tolist())]}

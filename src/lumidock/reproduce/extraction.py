@@ -78,9 +78,8 @@ def measure(dock: Dock, config: Config, settings: tuple[str, ...], seeds: tuple[
             T_dock_cam = np.diag([1.0, -1.0, -1.0, 1.0])
             T_dock_cam[:3, :3] = T_dock_cam[:3, :3] @ so3_exp(np.deg2rad(rng.uniform(-2.0, 2.0, 3)))
             T_dock_cam[:3, 3] = [*rng.uniform(-0.2, 0.2, 2), z]
-            image, _, _ = render_frame(
-                scenario, station, camera, T_dock_cam, np.empty((0, 2)), np.empty(0, np.int64), rng
-            )
+            nothing, no_light = np.empty((0, 2)), np.empty(0, np.int64)
+            image, _, _ = render_frame(scenario, station, camera, T_dock_cam, nothing, dark=no_light, rng=rng)
             uv, seen = in_view(station, camera, T_dock_cam)
             frame = Frame("0", 0, image)
             for name, detections in _detections(frame, config).items():

@@ -133,7 +133,7 @@ def count_rendered(simulation: Simulation, methods: Methods, config: Config) -> 
         rng = np.random.default_rng([simulation.seed, 3, number])
         _, seen = in_view(station, camera, T_dock_cam)
         dark = dark_lights(scenario, front[seen[front]], rng)
-        image, _, _ = render_frame(scenario, station, camera, T_dock_cam, spurious[number], dark, rng)
+        image, _, _ = render_frame(scenario, station, camera, T_dock_cam, spurious[number], dark=dark, rng=rng)
         uv = project_lights(camera, T_dock_cam, station.p_dock)
         uv[~seen], uv[dark] = np.nan, np.nan
         for name, localizer in localizers.items():

@@ -206,5 +206,7 @@ def rendered_frames(simulation: Simulation) -> Iterator[tuple[float, Frame]]:
     spurious = spurious_paths(scenario, t_ns, (camera.width, camera.height), paths)
     for number, (t, T_dock_cam) in enumerate(zip(t_ns.tolist(), poses, strict=True)):
         rng, nothing = np.random.default_rng([simulation.seed, 3, number]), np.empty(0, np.int64)
-        image, _, _ = render_frame(scenario, station, camera, T_dock_cam, spurious[number], nothing, rng)  # fmt: skip
+        image, _, _ = render_frame(
+            scenario, station, camera, T_dock_cam, spurious[number], dark=nothing, rng=rng
+        )  # fmt: skip
         yield float(T_dock_cam[2, 3]), Frame(f"{number:06d}", t, image)
