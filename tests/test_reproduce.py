@@ -43,6 +43,7 @@ TINY = replace(
     table_interval_s=4.0,
     ablation_trials=1,
     compared=6,
+    tuned=4,
     extraction_frames=1,
     draws=5,
     docking_interval_s=1.0,

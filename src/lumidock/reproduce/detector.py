@@ -19,8 +19,8 @@ _HEAD = [
     "false detections a frame",
 ]
 _CAPTION = (
-    "The default detector on rendered frames. {about} Lights up to {reach:g} m away, false detections of all frames; error "
-    "of the centre: rms of an axis over its own sigma, 1 where the covariance is right."
+    "The default detector on rendered frames. {about} Lights up to {reach:g} m away, false detections of all frames; "
+    "error of the centroid: rms of an axis over its own sigma, 1 where the covariance is right."
 )
 _REACH_M = 20.0
 

@@ -21,6 +21,7 @@ from lumidock.reproduce import (
     summary,
     swarm_figure,
     table1,
+    tuning,
 )
 from lumidock.reproduce.jobs import Job
 from lumidock.reproduce.plan import Plan
@@ -47,6 +48,7 @@ EXPERIMENTS = (
     Experiment("acquisition", acquisition.jobs, acquisition.section),
     Experiment("comparison", comparison.jobs, comparison.section),
     Experiment("ablations", ablations.jobs, ablations.section),
+    Experiment("tuning", tuning.jobs, tuning.section),
     Experiment("extraction", extraction.jobs, extraction.section),
     Experiment("envelope", envelope.jobs, envelope.section),
     Experiment("hazards", hazards.jobs, hazards.section),

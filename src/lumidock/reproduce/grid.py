@@ -19,6 +19,7 @@ class Grid:
     ablation_trials: int  # of each change, and of each size of the swarm
     draws: int  # poses at each distance, and of each acquisition
     compared: int  # frames of each condition that all baselines see
+    tuned: int  # candidates of the race for the swarm's coefficients; a power of two
     extraction_frames: int  # at each distance, in each water
     dockings: int  # rendered approaches
     docking_interval_s: float
@@ -43,6 +44,7 @@ QUICK = Grid(
     ablation_trials=1,
     draws=100,
     compared=40,
+    tuned=32,
     extraction_frames=1,
     dockings=1,
     docking_interval_s=0.15,
@@ -65,6 +67,7 @@ FULL = Grid(
     ablation_trials=30,
     draws=1000,
     compared=500,
+    tuned=64,
     extraction_frames=10,
     dockings=3,
     docking_interval_s=0.15,
