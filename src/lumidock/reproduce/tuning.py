@@ -31,8 +31,8 @@ _MISSING = 3
 _RANGES = {"inertia": (0.4, 0.95), "c1": (0.2, 3.0), "c2": (0.2, 3.0), "k": (0.4, 1.2), "stagnation": (4, 40)}
 _TEXT = (
     "The paper's outlook proposes to tune the swarm adaptively. Here inertia, both pulls, velocity scale and restart "
-    "are raced on one layout with three lights missing, for a swarm of 20 x 40, and the winner is measured on new frames "
-    "of that layout and on the layouts that it has not seen."
+    "are raced on one layout with three lights missing, for a swarm of 20 x 40, and the winner is measured on new "
+    "frames of that layout and on the layouts that it has not seen."
 )
 
 
