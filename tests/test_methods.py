@@ -98,3 +98,33 @@ def test_a_package_that_does_not_load_gives_one_line(installed, tmp_path):
     assert done.returncode == 2
     assert "nowhere" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--only", "table-2"], "--only table-2: no such section; there are table-1, "),
+        (["--method", "telepathy"], "--method telepathy: no such method; there are lumidock, paper, "),
+        (["--config", "preset.yaml"], "paper.preset: "),
+    ],
+)
+def test_reproduce_refuses_what_there_is_not_in_one_line(installed, tmp_path, words, line):
+    (tmp_path / "preset.yaml").write_text("paper: {preset: as_remembered}\n")
+    words = [str(tmp_path / word) if word.endswith(".yaml") else word for word in words]
+    done = lumidock(installed, "reproduce", *words, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert line in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_reproduce_puts_an_installed_method_into_its_tables(installed, tmp_path):
+    out = tmp_path / "out"
+    (tmp_path / "few.yaml").write_text("paper: {preset: as_printed}\n")
+    words = ["--only", "figure-7-11", "--method", "polar-order", "--config", tmp_path / "few.yaml", "--workers", 1]
+    done = lumidock(installed, "reproduce", *words, "--out", out, *DOCK)
+    assert done.returncode == 0, done.stderr
+    rows = list(csv.reader((out / "tables" / "figure-7-11-1.csv").open(newline="")))
+    assert rows[0][-1] == "polar-order"
+    assert [row[-1] for row in rows[1:3]] == ["right", "right"]
+    assert rows[5][-1] != "right"  # it knows no missing light

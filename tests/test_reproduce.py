@@ -229,6 +229,8 @@ def test_frames_in_memory_give_the_fixes_of_frames_on_disk(tmp_path):
         run(
             open_source(disk), localizer, folder, Setup("lumidock", False, Config(), STATION_FILE, disk / "camera.yaml")
         )
+    for folder, keep, methods in (("kept", True, ("paper", "lumidock")), ("memory", False, ("lumidock",))):
+        assert all(path.exists() for path in work.docking_leaves(tmp_path / folder, keep, methods))
     rows = fixes_of(tmp_path / "run")
     assert rows == fixes_of(tmp_path / "memory" / "lumidock") == fixes_of(tmp_path / "kept" / "lumidock")
     assert {"bad_frame", "bad_stamp"} <= {row["reason"] for row in rows}

@@ -45,7 +45,10 @@ def jobs(plan: Plan) -> list[Job]:
         settings = (f"path.frame_interval_s={grid.docking_interval_s}",)
         simulation = Simulation(plan.dock, "approach", settings, grid.first_seed + number)
         arguments = (simulation, str(folder), number == 0, plan.methods, plan.config)
-        weight, leaves = _APPROACH_M / grid.docking_interval_s * _FRAME_S, docking_leaves(folder, plan.methods)
+        weight, leaves = (
+            _APPROACH_M / grid.docking_interval_s * _FRAME_S,
+            docking_leaves(folder, number == 0, plan.methods),
+        )
         jobs.append(Job(f"docking-{number}", weight, docking, arguments, leaves, plan.code))
     return jobs
 

@@ -42,7 +42,7 @@ def _rendered(plan: Plan) -> list[Job]:
             folder = plan.out / "runs" / f"{name}-{seed}"
             simulation = Simulation(plan.dock, name, settings, grid.first_seed + seed)
             arguments = (simulation, str(folder), False, _METHODS, plan.config)
-            leaves, weight = docking_leaves(folder, _METHODS), _APPROACH_M / interval_s * _FRAME_S
+            leaves, weight = docking_leaves(folder, False, _METHODS), _APPROACH_M / interval_s * _FRAME_S
             jobs.append(Job(f"shipped-{name}-{seed}", weight, docking, arguments, leaves))
     return jobs
 

@@ -44,7 +44,7 @@ def jobs(plan: Plan) -> list[Job]:
     simulation = Simulation(plan.dock, "rectangle", settings, plan.grid.first_seed)
     arguments = (simulation, str(folder), True, plan.methods, plan.config)
     weight = 55.2 / plan.grid.search_interval_s * _FRAME_S
-    return [Job("search", weight, docking, arguments, docking_leaves(folder, plan.methods), plan.code)]
+    return [Job("search", weight, docking, arguments, docking_leaves(folder, True, plan.methods), plan.code)]
 
 
 def section(plan: Plan, results: Results) -> Section:

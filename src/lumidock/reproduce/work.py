@@ -112,9 +112,12 @@ def docking(simulation: Simulation, folder: str, keep: bool, methods: Methods, c
     return result
 
 
-def docking_leaves(folder: Path, methods: Methods) -> tuple[Path, ...]:
+def docking_leaves(folder: Path, keep: bool, methods: Methods) -> tuple[Path, ...]:
     """The files of `docking` that a page needs."""
-    return (folder / "sequence" / "truth.csv", *(folder / name / "fixes.csv" for name in methods))
+    of_sequence = ("truth.csv", "lights_truth.csv", "timestamps.csv", "station.yaml", "camera.yaml", *["frames"] * keep)
+    of_run = ("fixes.csv", "lights.csv", "run.json", "station.yaml", "camera.yaml")
+    sequence = tuple(folder / "sequence" / name for name in of_sequence)
+    return sequence + tuple(folder / method / name for method in methods for name in of_run)
 
 
 def _setup(name: str, config: Config) -> tuple[str, bool, Config]:
