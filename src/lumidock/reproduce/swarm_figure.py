@@ -75,7 +75,7 @@ def _particles(result: dict[str, Any], name: str) -> Plot:
     count = len(one["particles"][0])
     caption = (
         f"{count} particles, {len(one['best'])} iterations ({name}), {result['detections']} detections from z = "
-        f"{result['z_m']:.1f} m: tx, ty and theta (degrees), coloured by scale from dark (small) to light. Last panel: "
+        f"{result['z_m']:.1f} m: tx, ty and theta (degrees), coloured by scale from cyan (small) to pink. Last panel: "
         f"the lights (rings) and where the best transform puts the detections (crosses); {one['right']} of "
         f"{result['detections']} identities are right."
     )
@@ -89,7 +89,7 @@ def _draw(figure: Figure, narrow: bool, one: dict[str, Any]) -> None:
     for k, (iteration, particles) in enumerate(zip(one["iterations"], one["particles"], strict=True)):
         axes: Any = figure.add_subplot(rows, columns, k + 1, projection="3d")
         theta, s, tx, ty, _ = np.array(particles).T
-        axes.scatter(tx, ty, np.rad2deg(theta), c=s, s=9, cmap="viridis", vmin=0.0, vmax=scales.max(), depthshade=False)
+        axes.scatter(tx, ty, np.rad2deg(theta), c=s, s=9, cmap="cool", vmin=0.0, vmax=scales.max(), depthshade=False)
         axes.set(title=f"iteration {iteration + 1}", xlabel="tx", ylabel="ty", zlim=(-10, 10), xlim=reach, ylim=reach)
         axes.tick_params(labelsize=6, pad=-2)
         for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
