@@ -39,15 +39,16 @@ ROWS = (*((*faults, False) for faults in TABLE_1), (1, 1, False), (1, 1, True), 
 SMALL, LARGE = "20 x 40, printed bounds", "80 x 120, wide bounds"
 _SAME_PX = 4.0  # a detection so near to the projection of a light is that light; at least, its own radius
 _TEXT = (
-    "The paper's section 4.1 at point level: centroids with 0.5 px of noise, runs toward the dock at 1.5 m/s and 4 Hz. A "
-    "frame counts when all seven front lights are in view. It is right when every true detection carries the identity of "
-    "its own light and no spurious one carries any, and wrong when any identity is not so; the rest has no answer, or a "
-    "partial one. The swarm stands alone, without filter; a swarm with history uses eqs. (7) and (8). Per cent with the "
-    "95 % interval (Wilson), and the frames with a wrong identity. The paper gives neither the size of its swarm nor where "
-    "its trials begin, so both are varied; the rows from 18.6 m are the nearer frames of the same runs. A swarm of 20 x 40 "
-    "with history from 18.6 m comes nearest to the paper's row; from 30 m the printed bounds do not always hold the "
-    "alignment beside two spurious detections. As printed, the whole method has no branch for missing lights, and so "
-    "stays below the paper's figure where three are missing; the ablations show it."
+    "The paper's section 4.1 at point level: centroids with 0.5 px of noise, runs toward the dock at 1.5 m/s and 4 "
+    "Hz. A frame counts when all seven front lights are in view. It is right when every true detection carries the "
+    "identity of its own light and no spurious one carries any, and wrong when any identity is not so; the rest has "
+    "no answer, or a partial one. The swarm stands alone, without filter; a swarm with history uses eqs. (7) and "
+    "(8). Per cent with the 95 % interval (Wilson), and the frames with a wrong identity. The paper gives neither "
+    "the size of its swarm nor where its trials begin, so both are varied; the rows from 18.6 m are the nearer "
+    "frames of the same runs. A swarm of 20 x 40 with history from 18.6 m comes nearest to the paper's row; from 30 "
+    "m the printed bounds do not always hold the alignment beside two spurious detections. As printed, the whole "
+    "method has no branch for missing lights, and so stays below the paper's figure where three are missing; the "
+    "ablations show it."
 )
 
 
