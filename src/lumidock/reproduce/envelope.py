@@ -81,7 +81,12 @@ def section(plan: Plan, results: Results) -> Section:
             r = results[f"envelope-{name}-{seed}"]
             cells = [span(r["paper"]["valid"]), span(r["lumidock"]["valid"]), span(r["lumidock"]["guide"])]
             rows.append([_row_name(name) + f", seed {seed}" * (len(seeds) > 1), *cells])
-    head = ["water and exposure", "recommended: pose, z m", "lumidock: pose, z m", "lumidock: bearing and range, z m"]
+    head = [
+        "water and exposure",
+        "paper, recommended: pose, z m",
+        "lumidock: pose, z m",
+        "lumidock: bearing and range, z m",
+    ]
     caption = (
         f"First and last true z in m, from 30 to -3 m at 1 m/s with a frame every {grid.envelope_interval_s:g} s; "
         "coarser frames make a filter's life harder. Light from above (60 W/m2 elsewhere) and salt in type III at 2 ms."

@@ -12,7 +12,7 @@ from lumidock.reproduce.grid import Grid
 from lumidock.station import Station, load_station
 
 AS_PRINTED = "paper-as-printed"  # the paper's method in its preset `as_printed`; `paper` is as configured
-TITLES = {AS_PRINTED: "as printed", "paper": "recommended", "lumidock": "lumidock"}
+TITLES = {AS_PRINTED: "paper, as printed", "paper": "paper, recommended", "lumidock": "lumidock"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,7 +37,7 @@ def section(results: Results) -> Section:
     for k, name in enumerate(TITLES.values()):
         met = sum(row[2][k][1] != WORSE for row in rows)
         tiles.append(
-            Tile(f"{met} of {len(rows)}", f"figures of the paper met by {name}", "good" if met == len(rows) else "bad")
+            Tile(f"{met} of {len(rows)}", f"of the paper's figures met: {name}", "good" if met == len(rows) else "bad")
         )
     return Section("The paper's figures", _TEXT, tiles=tiles, items=[_table(rows)])
 
