@@ -104,9 +104,9 @@ def compare(simulation: Simulation, layout: str, names: Methods, config: Config)
         localizer.forget()
         counts, times = {"right": 0, "wrong": 0, "refused": 0, "hazardous": 0}, []
         for frame in frames:
-            start = time.perf_counter()
+            start = time.process_time()
             fix = localizer.process_detections(frame.detections)
-            times.append(time.perf_counter() - start)
+            times.append(time.process_time() - start)
             right, wrong = verdict(fix, frame)
             counts["right"] += right
             counts["wrong"] += wrong
@@ -149,9 +149,9 @@ def solvers(dock: Dock, z_m: float, kind: str, count: int, seed: int) -> dict[st
 def _solved(name: str, drawn: _Drawn) -> dict[str, Any]:
     errors, rms, times, failed = [], [], [], 0
     for T, uv in zip(drawn.T_dock_cam, drawn.uv, strict=True):
-        start = time.perf_counter()
+        start = time.process_time()
         found = pnp.solutions(name, drawn.camera, drawn.p_dock, uv)
-        times.append(time.perf_counter() - start)
+        times.append(time.process_time() - start)
         if not found:
             failed += 1
             continue
@@ -183,9 +183,9 @@ def section(plan: Plan, results: Results) -> Section:
             cells = [share(counts[0], r["frames"]), *map(str, counts[1:]), f"{r[name]['ms']:.1f}"]
             rows.append([f"{_condition(key)}: {title(name)}", str(r["frames"]), *cells])
             totals[name] = [a + b for a, b in zip(totals[name], counts, strict=True)]
-    head = ["condition and method", "frames", "right, %", "wrong", "refused", "hazardous poses", "ms a frame"]
+    head = ["condition and method", "frames", "right, %", "wrong", "refused", "hazardous poses", "CPU ms a frame"]
     times = results[f"comparison-{_slug(SHIPPED, 'all seen')}"]["machine"]
-    table = Table(f"All methods on the same detections; times on {times}.", head, rows)
+    table = Table(f"All methods on the same detections; CPU time on {times}.", head, rows)
     return Section("Other people's methods", _TEXT, items=[_plot(totals), table, _solver_table(results)])
 
 
