@@ -1,8 +1,8 @@
 """Tag matching by an enhanced particle swarm with Hungarian assignment, paper section 3.2.1.
 
-Its particles search the similarity (roll, scale, shift) that lays the detections of one layer over its lights. Eq. (2) as
-printed sums over all pairs and has no minimum at the alignment, so the residual is taken one to one: the assignment is
-solved inside the fitness.
+Its particles search the similarity (roll, scale, shift) that lays the detections of one layer over its lights. Eq. (2)
+as printed sums over all pairs and has no minimum at the alignment, so the residual is taken one to one: the assignment
+is solved inside the fitness.
 """
 
 from __future__ import annotations
