@@ -1,4 +1,4 @@
-"""The backtracking filter: prediction, update, and association from history with lights missing and spurious ones about."""
+"""The backtracking filter: prediction, update and association with lights missing and spurious detections about."""
 
 import numpy as np
 import pytest
