@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from bench.shipped import CAMERA_FILE, STATION_FILE
+from lumidock.config import Config
 from lumidock.evaluation.metrics import read_rows, true_poses
-from lumidock.reproduce import work
+from lumidock.reproduce import Dock, work
 from lumidock.reproduce.jobs import Job, run_jobs
 from lumidock.sim.scenario import load_scenario, shipped_scenarios
 
@@ -36,8 +37,9 @@ _COLUMNS = (
 
 def docking(scenario: str, seed: int, folder: str) -> dict[str, Any]:
     """Figures of one docking: z of the first guide and of three valid poses in a row, gaps after, errors, hazards."""
-    dock, place = (str(STATION_FILE), str(CAMERA_FILE)), Path(folder)
-    judged = work.docking(dock, scenario, [], seed, folder, keep=False, methods=("lumidock",))["lumidock"]
+    place = Path(folder)
+    simulation = work.Simulation(Dock(str(STATION_FILE), str(CAMERA_FILE)), scenario, (), seed)
+    judged = work.docking(simulation, folder, False, ("lumidock",), Config())["lumidock"]
     figures = _figures(place / "lumidock", place / "sequence")
     shutil.rmtree(place)
     hazards = judged["hazardous"]

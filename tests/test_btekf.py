@@ -1,4 +1,4 @@
-"""The backtracking filter: prediction, update, and naming from history with lights missing and spurious ones about."""
+"""The backtracking filter: prediction, update and association with lights missing and spurious detections about."""
 
 import numpy as np
 import pytest
@@ -56,24 +56,24 @@ def test_prediction_covariance_agrees_with_sampling(rng):
 
 @pytest.mark.parametrize("z", [4.0, 9.0, 18.0])
 @pytest.mark.parametrize(("missing", "spurious"), [(0, 0), (3, 0), (2, 3), (3, 5), (4, 0)])
-def test_history_names_the_lights_that_are_left(rng, z, missing, spurious):
+def test_history_identifies_the_lights_that_are_left(rng, z, missing, spurious):
     for _ in range(4):
         T_dock_cam, predicted = moving(rng, z + 1.65)
         true = np.concatenate([rng.permutation(7)[missing:], np.full(spurious, -1)])
         uv = project_lights(CAMERA, T_dock_cam, P_DOCK)[true]
         away = rng.uniform(0, 2 * np.pi, spurious)
-        stray_uv = uv[0] + rng.uniform(60, 400, spurious)[:, None] * np.stack([np.cos(away), np.sin(away)], 1)
-        uv[true < 0] = stray_uv
-        nearest = np.linalg.norm(stray_uv[:, None] - project_lights(CAMERA, T_dock_cam, P_DOCK)[None], axis=2)
+        clutter_uv = uv[0] + rng.uniform(60, 400, spurious)[:, None] * np.stack([np.cos(away), np.sin(away)], 1)
+        uv[true < 0] = clutter_uv
+        nearest = np.linalg.norm(clutter_uv[:, None] - project_lights(CAMERA, T_dock_cam, P_DOCK)[None], axis=2)
         if spurious and nearest.min() < 20:
-            continue  # a stray on top of a light is not what is asked here
+            continue  # clutter on top of a light is not what is asked here
         track, light = btekf.correct(predicted, CAMERA, P_DOCK, uv + rng.normal(0, 0.3, uv.shape), CONFIG)
         assert light.tolist() == true.tolist()
         error = se3_log(se3_inverse(T_dock_cam) @ track.T_dock_cam)
         assert error @ np.linalg.solve(track.cov[:6, :6], error) < 35  # chi-square, 6 dof, 5e-6
 
 
-def test_backtracks_out_of_a_stray_that_is_nearer_than_the_light(rng):
+def test_backtracks_out_of_clutter_that_is_nearer_than_the_light(rng):
     T_dock_cam, predicted = moving(rng, 9.0)
     uv = project_lights(CAMERA, T_dock_cam, P_DOCK)
     bait = project_lights(CAMERA, predicted.T_dock_cam, P_DOCK)[2] + [5.0, -6.0]
@@ -96,7 +96,7 @@ def test_search_is_bounded(rng):
     assert btekf.correct(predicted, CAMERA, P_DOCK, uv, BtekfConfig(max_nodes=5)) is None
 
 
-def test_without_the_missing_branch_one_dark_light_with_a_stray_in_its_gate_voids_the_frame(rng):
+def test_without_the_missing_branch_one_dark_light_with_clutter_in_its_gate_voids_the_frame(rng):
     T_dock_cam, predicted = moving(rng, 9.0)
     uv = project_lights(CAMERA, T_dock_cam, P_DOCK)
     uv[6] += [9.0, -9.0]

@@ -53,7 +53,7 @@ def canvas(size=(700, 900), level=20):
     return np.clip(noise, 0, 255).astype(np.uint8)
 
 
-def spots_of(image):
+def lights_of(image):
     return extract.lights(Frame("0", 0, image), CONFIG)
 
 
@@ -62,7 +62,7 @@ def test_a_bar_and_a_rim_are_no_lights_and_a_disc_is_one():
     cv2.rectangle(image, (40, 40), (240, 52), 250, -1)
     cv2.ellipse(image, (350, 120), (60, 60), 0, 20, 220, 250, 4)
     cv2.circle(image, (120, 300), 14, 250, -1, cv2.LINE_AA)
-    detections = spots_of(image)
+    detections = lights_of(image)
     assert len(detections) == 1
     np.testing.assert_allclose(detections.uv[0], [120, 300], atol=0.2)
     assert detections.radius_px[0] == pytest.approx(14, abs=1)
@@ -72,14 +72,14 @@ def test_touching_halos_are_cut_apart():
     image = canvas()
     for u in (200, 239):
         cv2.circle(image, (u, 200), 20, 250, -1, cv2.LINE_AA)
-    detections = spots_of(image)
+    detections = lights_of(image)
     np.testing.assert_allclose(np.sort(detections.uv[:, 0]), [200, 239], atol=1.5)
 
 
 def test_a_light_cut_by_the_edge_keeps_its_centre():
     image = canvas()
     cv2.circle(image, (889, 200), 24, 250, -1, cv2.LINE_AA)  # the centre is 10 px inside
-    np.testing.assert_allclose(spots_of(image).uv, [[889, 200]], atol=0.5)
+    np.testing.assert_allclose(lights_of(image).uv, [[889, 200]], atol=0.5)
 
 
 @pytest.mark.parametrize("radius", [8, 24, 60])
@@ -87,22 +87,22 @@ def test_a_light_cut_by_the_edge_keeps_its_centre():
 def test_a_blurred_light_cut_by_any_edge_is_found(at, radius):
     image = canvas()
     cv2.circle(image, at, radius, 250, -1, cv2.LINE_AA)
-    np.testing.assert_allclose(spots_of(cv2.GaussianBlur(image, (0, 0), 2.0)).uv, [at], atol=0.7)
+    np.testing.assert_allclose(lights_of(cv2.GaussianBlur(image, (0, 0), 2.0)).uv, [at], atol=0.7)
 
 
 @pytest.mark.parametrize("level", [0, 20, 255])
 def test_an_even_picture_has_no_lights(level):
-    assert len(spots_of(np.full((300, 400), level, np.uint8))) == 0
-    assert len(spots_of(canvas(level=level))) == 0
+    assert len(lights_of(np.full((300, 400), level, np.uint8))) == 0
+    assert len(lights_of(canvas(level=level))) == 0
 
 
 def test_noise_and_ten_thousand_specks_stay_bounded():
     image = np.random.default_rng(1).integers(0, 255, (600, 800)).astype(np.uint8)
-    assert len(spots_of(image)) <= CONFIG.max_regions
+    assert len(lights_of(image)) <= CONFIG.max_regions
     specks = canvas((1200, 1600))
     at = np.random.default_rng(2).integers(2, 1198, (10_000, 2))
     specks[at[:, 0], at[:, 1]] = 255
-    assert len(spots_of(specks)) <= CONFIG.max_regions
+    assert len(lights_of(specks)) <= CONFIG.max_regions
 
 
 def test_otsu_parts_two_levels_and_agrees_with_opencv(rng):

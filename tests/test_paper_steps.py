@@ -31,7 +31,7 @@ def test_normalize_is_undone_by_its_mean_and_scale(rng):
 
 
 @pytest.mark.parametrize("seen", [7, 6, 5, 4])
-def test_swarm_names_the_lights_of_a_shifted_scaled_rolled_view(rng, seen):
+def test_swarm_identifies_the_lights_of_a_shifted_scaled_rolled_view(rng, seen):
     for _ in range(5):
         order = rng.permutation(7)[:seen]
         view = similarity(FRONT[order], rng.uniform(-0.15, 0.15), rng.uniform(10, 300), rng.uniform(-500, 500, 2))
@@ -39,7 +39,7 @@ def test_swarm_names_the_lights_of_a_shifted_scaled_rolled_view(rng, seen):
 
 
 @pytest.mark.parametrize("spurious", [1, 2])
-def test_swarm_leaves_strays_without_a_name(rng, spurious):
+def test_swarm_gives_spurious_detections_no_light(rng, spurious):
     view = similarity(FRONT, 0.05, 100.0, np.array([20.0, -30.0]))
     view = np.concatenate([view, rng.uniform(-300, 300, (spurious, 2))])
     assert register(view, FRONT, None, PsoConfig(), rng).light.tolist() == [*range(7), *[-1] * spurious]
@@ -85,7 +85,7 @@ def test_ratio_filter_refuses_a_swapped_pair(swap):
     assert not consistent(FRONT, 100.0 * FRONT[order], ConsistencyConfig())
 
 
-def test_ratio_filter_refuses_mirrors_strays_and_coincident_spots():
+def test_ratio_filter_refuses_mirror_images_clutter_and_coincident_detections():
     view = 100.0 * FRONT
     assert not consistent(FRONT, view[[0, 1, 2, 3, 4, 5, 5]], ConsistencyConfig())
     assert not consistent(FRONT, np.concatenate([view[:6], view[6:] + 40.0]), ConsistencyConfig())

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, PositiveInt
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, PositiveInt, model_validator
 
 from lumidock.yamlfile import read_mapping, validate
 
@@ -33,8 +33,8 @@ class SettingsGroup(BaseModel):
 class ExtractConfig(SettingsGroup):
     """Light extraction, paper section 3.1.1."""
 
-    gray: Literal["max", "luma"] = "max"  # luma weighs blue by 0.114 and loses the rear layer
-    contrast: PositiveFloat = 5.0  # sigmas of the background that a threshold, or a spot's peak, must clear ...
+    gray: Literal["max", "luma"] = "max"  # the paper says only "grayscale"; luma weighs blue by 0.114
+    contrast: PositiveFloat = 5.0  # sigmas of the background that a threshold, or a blob's peak, must clear ...
     max_foreground: Fraction = 0.02  # ... with no more than this share of the frame as foreground
     min_step: PositiveFloat = 4.0  # grey levels above the background mode below which nothing is a light
     class_gap: PositiveFloat = 5.0  # a core this many sigmas above its rim is cut out of it; a blurred disc has 3
@@ -54,7 +54,8 @@ class ExtractConfig(SettingsGroup):
 class LayersConfig(SettingsGroup):
     """Layer discrimination, paper section 3.1.2."""
 
-    method: Literal["auto", "color", "radius"] = "auto"  # auto: colour where the frame has any
+    # auto: colour where the frame has any, else radius; color_or_radius: radius also where no detection is blue
+    method: Literal["auto", "color", "radius", "color_or_radius"] = "auto"
     blue_hue: tuple[Hue, Hue] = (98, 132)  # OpenCV hue, 0-179
     min_saturation: int = 60  # of 255; a saturated white core has none
     min_value: int = 25  # of 255
@@ -77,8 +78,8 @@ class PsoConfig(SettingsGroup):
     scale: Bounds = (
         0.5,
         12.0,
-    )  # the paper's (0.5, 8) and (-1, 1) bear a stray light at the picture's edge
-    shift: Bounds = (-2.0, 2.0)  # from 18.64 m on; from 30 m it takes more
+    )  # the paper's (0.5, 8) and (-1, 1) hold the alignment with one spurious detection at the picture's edge ...
+    shift: Bounds = (-2.0, 2.0)  # ... from 18.64 m on; from 30 m it takes more
     # eq. (2) prints the sum over all pairs, which has no minimum at the alignment
     residual: Literal["one_to_one", "all_pairs"] = "one_to_one"
     w1: PositiveFloat = 1.0  # eq. (8), this frame's residual
@@ -103,8 +104,11 @@ class BtekfConfig(SettingsGroup):
     gate: PositiveFloat = 13.8  # M^2 of eq. (12): chi-square, 2 dof, 99.9 %
     pixel_sigma: PositiveFloat = 1.0  # px, R of eq. (13)
     accept_px: PositiveFloat = 4.0  # reprojection residual after an update
+    # section 3.2.3 e as printed: the filter's own pose is the answer of its frame, and the next frame is associated by
+    # the lights reprojected from it; otherwise SQPnP solves every frame, and the swarm opens the next one
+    pose_from_filter: bool = False
     min_lights: Annotated[int, Field(ge=3)] = 3  # section 3.2.3 e
-    three_light_gap_s: PositiveFloat = 0.5  # three lights fit any three spots: only so long after a fix of four or more
+    three_light_gap_s: PositiveFloat = 0.5  # three lights fit any three detections; only so soon after four
     accel_m_s2: PositiveFloat = 0.5  # white noise on the velocity, per axis
     accel_rad_s2: PositiveFloat = 0.15
     start_speed_m_s: PositiveFloat = 1.0  # 1 sigma of the unknown velocity at the first fix
@@ -114,14 +118,29 @@ class BtekfConfig(SettingsGroup):
 
 
 class PoseConfig(SettingsGroup):
-    """When a layer's pose is believed, paper section 3.3."""
+    """When the pose of a layer is accepted, paper section 3.3."""
 
     max_rms_px: PositiveFloat = 6.0  # of the reprojection
 
 
-class PaperConfig(SettingsGroup):
-    """The paper's method."""
+# What `preset: as_printed` changes of the defaults; docs/paper-method.md gives the reason and the effect of each.
+AS_PRINTED: dict[str, dict[str, Any]] = {
+    "extract": {"gray": "luma"},
+    "layers": {"method": "color_or_radius"},
+    "pso": {"particles": 20, "iterations": 40, "scale": (0.5, 8.0), "shift": (-1.0, 1.0)},
+    "btekf": {
+        "noise_in_gate": False,
+        "missing_branch": False,
+        "pose_from_filter": True,
+        "three_light_gap_s": 2.0,
+    },
+}
 
+
+class PaperConfig(SettingsGroup):
+    """The paper's method; settings that are given beside a `preset` go before those of the preset."""
+
+    preset: Literal["recommended", "as_printed"] = "recommended"
     extract: ExtractConfig = ExtractConfig()
     layers: LayersConfig = LayersConfig()
     pso: PsoConfig = PsoConfig()
@@ -130,6 +149,14 @@ class PaperConfig(SettingsGroup):
     max_lights: PositiveInt = 40  # of a layer; the ratio filter looks at all triples
     btekf: BtekfConfig = BtekfConfig()
     pose: PoseConfig = PoseConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_preset(cls, given: Any) -> Any:  # noqa: ANN401  # pydantic passes whatever the file holds
+        if not isinstance(given, dict) or given.get("preset") != "as_printed":
+            return given
+        preset = {name: settings for name, settings in AS_PRINTED.items() if isinstance(given.get(name, {}), dict)}
+        return given | {name: settings | given.get(name, {}) for name, settings in preset.items()}
 
 
 class DetectConfig(SettingsGroup):
@@ -269,6 +296,7 @@ class Config(SettingsGroup):
     integrity: IntegrityConfig = IntegrityConfig()
     detect: DetectConfig = DetectConfig()
     label: LabelConfig = LabelConfig()
+    methods: dict[str, dict[str, Any]] = {}  # settings of the methods that installed packages add, by their names
 
 
 def load_config(path: Path | str) -> Config:

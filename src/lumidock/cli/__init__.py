@@ -297,7 +297,8 @@ def _campaign(
     ],
     seeds: Annotated[str, typer.Option(metavar="A:B", help="Seeds A to B - 1, a run of each scenario each.")] = "0:10",
     methods: Annotated[
-        list[str] | None, typer.Option("--method", metavar="NAME", help="lumidock (default) or paper; may be repeated.")
+        list[str] | None,
+        typer.Option("--method", metavar="NAME", help="lumidock (default), paper, ...; may be repeated."),
     ] = None,
     cold: Annotated[bool, typer.Option("--cold", help="Forget all history before each frame.")] = False,
     settings: Annotated[

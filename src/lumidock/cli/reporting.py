@@ -13,6 +13,7 @@ from lumidock.cli.shared import (
     DEFAULT_STATION,
     AsJson,
     CameraOption,
+    ConfigOption,
     Force,
     StationOption,
     Workers,
@@ -63,6 +64,7 @@ def _report(
     "reproduce",
     epilog=example(
         "lumidock reproduce --quick --out REPRODUCTION",
+        "lumidock reproduce --only table-1 --only docking --out REPRODUCTION",
         "lumidock reproduce --full --out REPRODUCTION",
     ),
 )
@@ -74,19 +76,35 @@ def _reproduce(
         ),
     ],
     full: Annotated[bool, typer.Option("--full/--quick", help="Hours, or minutes (default).")] = False,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", metavar="SECTION", help="This section only; may be repeated.")
+    ] = None,
+    methods: Annotated[
+        list[str] | None, typer.Option("--method", metavar="NAME", help="A further method; may be repeated.")
+    ] = None,
+    config: ConfigOption = None,
     workers: Workers = None,
     station: StationOption = None,
     camera: CameraOption = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Repeat the paper's experiments by both methods, as one page."""
-    from lumidock.reproduce import FULL, QUICK, reproduce
+    """Repeat the paper's experiments by its method and ours, as one page."""
+    from lumidock.config import Config, load_config
+    from lumidock.methods import METHODS, require_method
+    from lumidock.reproduce import FULL, QUICK, Dock, Plan, reproduce
 
-    files = shipped_or_path("station", station or DEFAULT_STATION), shipped_or_path("camera", camera or DEFAULT_CAMERA)
+    for method in methods or ():
+        require_method(method)
+    extra = tuple(name for name in dict.fromkeys(methods or ()) if name not in METHODS)
+    dock = Dock(
+        str(shipped_or_path("station", station or DEFAULT_STATION)),
+        str(shipped_or_path("camera", camera or DEFAULT_CAMERA)),
+    )
+    plan = Plan(FULL if full else QUICK, dock, out, load_config(config) if config else Config(), extra)
     left = f"{out} holds the finished parts; the same command continues with the others"
     with told_at_interrupt(left), progress_bar("reproduce, s of work") as progress:
-        results = reproduce(FULL if full else QUICK, *files, out, force=force, workers=workers, progress=progress)
+        results = reproduce(plan, only=only or (), force=force, workers=workers, progress=progress)
     if as_json:
         print(json.dumps(results, indent=1))
         return

@@ -73,7 +73,9 @@ SourceArgument = Annotated[
         metavar="SOURCE", help="Sequence or image folder, video, bag, sim:SCENARIO[:SEED], or a camera's address."
     ),
 ]
-Method = Annotated[str, typer.Option("--method", metavar="NAME", help="lumidock, or paper.")]
+Method = Annotated[
+    str, typer.Option("--method", metavar="NAME", help="lumidock, paper, a baseline, or one of an installed package.")
+]
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="YAML file of settings that differ from the defaults.")
 ]

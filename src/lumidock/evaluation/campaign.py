@@ -34,7 +34,7 @@ from lumidock.errors import InputError, LumidockError
 from lumidock.evaluation.campaign_table import markdown, row_of
 from lumidock.evaluation.counts import SimulatedRun, Tally, tally_run
 from lumidock.evaluation.cramer_rao import Bound
-from lumidock.methods import Method, localizer_of
+from lumidock.methods import Method, implementation, localizer_of
 from lumidock.sim.detections import SimulatedFrame, simulated_frames
 from lumidock.sim.scenario import Scenario
 from lumidock.station import Station, load_station
@@ -135,6 +135,8 @@ def plan(
         config = validate(Config, parsed.config, f"{parsed.name}: config")
         for method in dict.fromkeys(methods):
             what = shared | {"scenario": scenario, "config": config.model_dump_json(), "method": method}
+            if code := implementation(method):
+                what |= {"implementation": code}
             for first, stop in _blocks(seeds):
                 key = _digest(json.dumps(what | {"seeds": [first, stop]}).encode())[:16]
                 shard = Shard(

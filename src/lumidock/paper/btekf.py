@@ -1,4 +1,4 @@
-"""The backtracking extended Kalman filter that names lights from history, paper section 3.2.3.
+"""The backtracking extended Kalman filter that identifies lights from history, paper section 3.2.3.
 
 The state is the pose (right perturbation of T_dock_cam) and the twist in `cam`: the paper's "Gaussian motion model
 constructed from previous pose estimates". The gate of eq. (12) as printed has no measurement noise; here it has, and
@@ -99,10 +99,10 @@ class _Gate:
 def correct(
     predicted: Track, camera: Camera, p_dock: Array, uv: Array, config: BtekfConfig
 ) -> tuple[Track, Indices] | None:
-    """Name the spots `uv` (N, 2) after the lights `p_dock` (M, 3) from a predicted track.
+    """Associate the detections `uv` (N, 2) with the lights `p_dock` (M, 3) from a predicted track.
 
-    Returns the updated track and the light of each spot (N,), -1 for none; None when fewer than `min_lights` hold.
-    Fewer missing lights are tried before more.
+    Returns the updated track and the light of each detection (N,), -1 for none; None when fewer than `min_lights` are
+    identified. Fewer missing lights are tried before more.
     """
     order = _gated_lights(predicted, camera, p_dock, uv, config)
     search = _Search(camera, p_dock, uv, config)
@@ -115,7 +115,7 @@ def correct(
 
 
 def _gated_lights(predicted: Track, camera: Camera, p_dock: Array, uv: Array, config: BtekfConfig) -> list[int]:
-    """Lights with at least one spot inside their gate, in order of their smallest gating residual."""
+    """Lights with at least one detection inside their gate, in order of their smallest gating residual."""
     best: dict[int, float] = {}
     for i, p in enumerate(p_dock):
         gate = _Gate.of(predicted, camera, p, config)
@@ -126,62 +126,62 @@ def _gated_lights(predicted: Track, camera: Camera, p_dock: Array, uv: Array, co
 
 
 class _Search:
-    """Depth-first search over the lights, each given a spot or, while allowed, declared missing."""
+    """Depth-first search over the lights, each given a detection or, while allowed, declared missing."""
 
     def __init__(self, camera: Camera, p_dock: Array, uv: Array, config: BtekfConfig) -> None:
         self.camera, self.p_dock, self.uv, self.config = camera, p_dock, uv, config
         self.nodes = 0
 
     def run(self, track: Track, lights: list[int], used: frozenset[int], missing: int) -> Track | None:
-        """The track after all `lights` found their place with at most `missing` left out; None: backtrack."""
+        """The track after all `lights` are associated with at most `missing` left out; None: backtrack."""
         if not lights:
             return track
         self.nodes += 1
         if self.nodes > self.config.max_nodes:
             return None
         light, rest = lights[0], lights[1:]
-        for blob, updated in self._candidates(track, light, used):
-            done = self.run(updated, rest, used | {blob}, missing)
+        for detection, updated in self._candidates(track, light, used):
+            done = self.run(updated, rest, used | {detection}, missing)
             if done is not None:
                 return done
         return self.run(track, rest, used, missing - 1) if missing else None
 
     def _candidates(self, track: Track, light: int, used: frozenset[int]) -> list[tuple[int, Track]]:
-        """Spots inside the light's gate, nearest first, whose update leaves an acceptable residual."""
+        """Detections inside the gate of the light, nearest first, whose update leaves an acceptable residual."""
         gate = _Gate.of(track, self.camera, self.p_dock[light], self.config)
         if gate is None:
             return []
         d2 = gate.distance2(self.uv)
         accepted = []
-        for blob in np.argsort(d2, kind="stable"):
-            if d2[blob] > self.config.gate:
+        for detection in np.argsort(d2, kind="stable"):
+            if d2[detection] > self.config.gate:
                 break
-            if int(blob) in used:
+            if int(detection) in used:
                 continue
-            updated = gate.update(track, self.uv[blob])
-            residual = project_lights(self.camera, updated.T_dock_cam, self.p_dock[light][None])[0] - self.uv[blob]
+            updated = gate.update(track, self.uv[detection])
+            residual = project_lights(self.camera, updated.T_dock_cam, self.p_dock[light][None])[0] - self.uv[detection]
             if np.hypot(*residual) < self.config.accept_px:
-                accepted.append((int(blob), updated))
+                accepted.append((int(detection), updated))
         return accepted
 
 
 def _accept(
     track: Track, camera: Camera, p_dock: Array, uv: Array, config: BtekfConfig
 ) -> tuple[Track, Indices] | None:
-    """Section 3.2.3 e: reproject every light, take the nearest spot within the pixel threshold."""
+    """Section 3.2.3 e: reproject every light, take the nearest detection within the pixel threshold."""
     light = associate(project_lights(camera, track.T_dock_cam, p_dock), uv, config.accept_px)
     return (track, light) if (light >= 0).sum() >= config.min_lights else None
 
 
 def associate(projected: Array, uv: Array, max_px: float) -> Indices:
-    """Light of each spot `uv` (N, 2): one to one, nearest pairs first, none farther than `max_px`; -1 for none."""
+    """Light of each detection `uv` (N, 2): one to one, nearest pairs first, none farther than `max_px`; -1 for none."""
     distance = np.linalg.norm(uv[:, None] - projected[None], axis=2)
     distance[np.isnan(distance)] = np.inf
     light = np.full(len(uv), -1, np.int64)
     for flat in np.argsort(distance, axis=None, kind="stable"):
-        blob, candidate = np.unravel_index(flat, distance.shape)
-        if distance[blob, candidate] > max_px:
+        detection, candidate = np.unravel_index(flat, distance.shape)
+        if distance[detection, candidate] > max_px:
             break
-        if light[blob] < 0 and candidate not in light:
-            light[blob] = candidate
+        if light[detection] < 0 and candidate not in light:
+            light[detection] = candidate
     return light

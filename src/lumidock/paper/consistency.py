@@ -9,14 +9,14 @@ from lumidock.datatypes import Array
 
 
 def consistent(lights_xy: Array, xy: Array, config: ConsistencyConfig) -> bool:
-    """Whether the matched spots `xy` (N, 2) look like their lights `lights_xy` (N, 2) in every triple; N >= 3.
+    """Whether associated detections `xy` (N, 2) agree with their lights `lights_xy` (N, 2) in every triple; N >= 3.
 
     The angle is taken between P_i P_j and P_j P_k as the vectors of eq. (10) have it; with both point sets treated
     alike it does not matter that the text calls it the angle at P_i.
     """
     ratio, angle = _triples(lights_xy)
     seen_ratio, seen_angle = _triples(xy)
-    with np.errstate(divide="ignore", invalid="ignore"):  # coincident spots give NaN, and NaN is not consistent
+    with np.errstate(divide="ignore", invalid="ignore"):  # coincident detections give NaN, and NaN is not consistent
         ratios_hold = np.abs(1.0 - ratio / seen_ratio) < config.ratio  # Eq. (9)
     angles_hold = np.abs(seen_angle - angle) < np.deg2rad(config.angle_deg)  # Eq. (10)
     return bool((ratios_hold & angles_hold).all())

@@ -59,7 +59,8 @@ def lights(frame: Frame, config: ExtractConfig) -> Detections:
     columns = np.array([[s.u, s.v, s.radius, s.flux] for s in blobs]).reshape(-1, 4)
     unknown = np.full(len(blobs), np.nan)
     uv, radius_px, flux = columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy()
-    return Detections(frame.name, frame.t_ns, uv, radius_px, flux, np.ones(len(blobs)), unknown)
+    likely = np.ones(len(blobs))
+    return Detections(frame.name, frame.t_ns, uv, radius_px, flux, p_light=likely, p_rear=unknown)
 
 
 def _separated(gray: Image, config: ExtractConfig) -> tuple[int, int, Image, list[Array]]:
@@ -237,7 +238,7 @@ def _fit_arc(outline: Array, size: tuple[int, int], config: ExtractConfig) -> tu
 
 
 def _stands_out(blob: _Blob, gray: Image, config: ExtractConfig) -> bool:
-    """Whether a small spot's peak clears the noise of the ring around it; large ones were judged by their shape."""
+    """Whether the peak of a small blob clears the noise around it; large ones were judged by their shape."""
     if np.pi * blob.radius**2 >= config.small_area_px:
         return True
     u, v, reach = round(blob.u), round(blob.v), int(1.5 * blob.radius) + 4
@@ -250,7 +251,7 @@ def _stands_out(blob: _Blob, gray: Image, config: ExtractConfig) -> bool:
 
 
 def _centroid(weights: Array) -> Array:
-    """Centre (2,) of a spot too small for a circle, weighted by its grey levels."""
+    """Centroid (2,) of a blob too small for a circle, weighted by its grey levels."""
     rows, columns = np.indices(weights.shape)
     return np.asarray([(weights * columns).sum(), (weights * rows).sum()] / weights.sum())
 

@@ -7,7 +7,7 @@ from lumidock.paper.layer import MIN_FOR_SWARM
 
 
 class Guidance:
-    """Chooses the layer that guides and names the stage; remembers both.
+    """Chooses the layer that guides, and the stage of the docking; remembers both.
 
     `layers` are (name, number of lights), front first; with one layer there is no hand-over.
     """

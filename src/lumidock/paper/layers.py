@@ -12,7 +12,7 @@ from lumidock.datatypes import Array, Detections, Frame, Image
 
 
 def label_by_color(frame: Frame, detections: Detections, config: LayersConfig) -> Detections:
-    """Set `p_rear` to the share of each spot's surroundings that is blue; NaN for a mono frame.
+    """Set `p_rear` to the share of the surroundings of each detection that is blue; NaN for a mono frame.
 
     A saturated core is white whatever the lamp, so the ring around it is asked.
     """
@@ -26,7 +26,7 @@ def label_by_color(frame: Frame, detections: Detections, config: LayersConfig) -
 
 
 def _blue_share(image: Image, center: Array, radius: float, config: LayersConfig) -> float:
-    """Share of the pixels between 0.8 and 1.6 radii (within the radius, for small spots) in the blue range of HSV."""
+    """Share of the pixels between 0.8 and 1.6 radii (small detections: within the radius) in the blue range of HSV."""
     small = radius < 3.0
     reach = max(radius, 1.0) if small else 1.6 * radius
     (u0, v0), (u1, v1) = np.floor(center - reach).astype(int), np.ceil(center + reach).astype(int) + 1
@@ -42,21 +42,25 @@ def _blue_share(image: Image, center: Array, radius: float, config: LayersConfig
 
 
 class LayerDiscriminator:
-    """Splits the spots of a frame into front and rear, with the dual-cluster counter m as its memory."""
+    """Splits the detections of a frame into front and rear, with the dual-cluster counter m as its memory."""
 
     def __init__(self, config: LayersConfig) -> None:
         self.config = config
         self.dual_frames = 0  # m
 
     def rear(self, detections: Detections) -> np.ndarray:
-        """Whether each spot (N,) belongs to the rear layer."""
-        known = np.isfinite(detections.p_rear).any()
-        by_color = self.config.method == "color" or (self.config.method == "auto" and known)
-        rear = detections.p_rear > self.config.min_blue if by_color else self._by_radius(detections.radius_px)
-        return np.asarray(rear)
+        """Whether each detection (N,) belongs to the rear layer."""
+        blue = np.asarray(detections.p_rear > self.config.min_blue)
+        by_color = {
+            "color": True,
+            "radius": False,
+            "auto": bool(np.isfinite(detections.p_rear).any()),
+            "color_or_radius": bool(blue.any()),
+        }[self.config.method]
+        return blue if by_color else self._by_radius(detections.radius_px)
 
     def _by_radius(self, radius_px: Array) -> np.ndarray:
-        """Two clusters when they differ enough and each is big enough; else one, named after the history."""
+        """Two clusters when they differ enough and each is big enough; else one, whose layer the history decides."""
         small = smaller_cluster(radius_px)
         counts = small.sum(), (~small).sum()
         if min(counts) >= self.config.min_cluster:
@@ -71,7 +75,7 @@ def smaller_cluster(radius_px: Array) -> np.ndarray:
     """Members (N,) of the smaller-radius cluster of the split in two with the least variance: eq. (1), solved exactly.
 
     In one dimension the best clusters are contiguous, so every cut of the sorted radii is tried. NaN radii and fewer
-    than two spots give no members.
+    than two detections give no members.
     """
     members = np.zeros(len(radius_px), bool)
     if len(radius_px) < 2 or not np.isfinite(radius_px).all():

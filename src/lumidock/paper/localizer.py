@@ -42,7 +42,7 @@ class PaperLocalizer:
         self._last_t_ns: int | None = None
 
     def process(self, frame: Frame) -> Fix:
-        """Image door; takes 8 bits of any frame. Raises: FrameError when the image is not of the camera's size."""
+        """Fix of one frame, reduced to 8 bits. Raises: FrameError when the image is not of the camera's size."""
         height, width = frame.image.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             wanted = f"{self.camera.width}x{self.camera.height}"
@@ -52,7 +52,7 @@ class PaperLocalizer:
         return self.process_detections(label_by_color(frame, detections, self.config.layers))
 
     def process_detections(self, detections: Detections) -> Fix:
-        """Light door: detections from another detector, or from `process`.
+        """Fix of one frame's detections, from another detector or from `process`.
 
         A stamp that does not follow the one before gives no fix; the stamp after it is measured against it, so that a
         clock that was set back costs one frame and the history.
@@ -82,17 +82,17 @@ class PaperLocalizer:
         )
 
     def _locate(self, detections: Detections) -> tuple[np.ndarray, list[LayerAnswer]]:
-        """Light of each spot (N,) and what each layer answered."""
+        """Light of each detection (N,) and the answer of each layer."""
         light = np.full(len(detections), -1, np.int64)
         answers = []
-        for layer, blobs in zip(self._layers, self._split(detections), strict=True):
-            answer = layer.locate(detections.t_ns, detections.uv[blobs])
-            light[blobs] = answer.light
+        for layer, members in zip(self._layers, self._split(detections), strict=True):
+            answer = layer.locate(detections.t_ns, detections.uv[members])
+            light[members] = answer.light
             answers.append(answer)
         return light, answers
 
     def _split(self, detections: Detections) -> list[np.ndarray]:
-        """Which spots (N,) belong to each layer, front first."""
+        """Which detections (N,) belong to each layer, front first."""
         inside = self.camera.contains(detections.uv)
         if len(self._layers) == 1:
             return [inside]

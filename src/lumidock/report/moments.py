@@ -36,7 +36,13 @@ def annotated_images(view: RunView, most: int) -> list[AnnotatedImage]:
     """At most `most` images, the most telling first; none where the source has no frames at hand."""
     if view.source is None or view.source.kind == "detections" or not most:
         return []
-    chosen = _moments(view)[:most]
+    return images_of(view, _moments(view)[:most])
+
+
+def images_of(view: RunView, chosen: list[tuple[int, str]]) -> list[AnnotatedImage]:
+    """Annotated images of the frames `chosen`, number and title of each, in their order."""
+    if view.source is None or view.source.kind == "detections":
+        return []
     frames = dict(_items(view, sorted(k for k, _ in chosen)))
     return [_annotated(view, view.fixes[k], developed(frames[k]), title) for k, title in chosen if k in frames]
 

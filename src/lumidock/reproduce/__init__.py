@@ -1,4 +1,4 @@
-"""Every experiment of the paper's section 4 by both methods, and what the paper leaves open, as one page."""
+"""Every experiment of the paper's section 4, and what it leaves open, by several methods, as one page."""
 
 from __future__ import annotations
 
@@ -12,41 +12,40 @@ from typing import Any
 from lumidock.errors import InputError
 from lumidock.evaluation.campaign import read_json, write_whole
 from lumidock.report import page
-from lumidock.report.page import PageSection, Table
-from lumidock.reproduce.experiments import jobs_of
+from lumidock.reproduce.experiments import EXPERIMENTS, jobs_of, sections_of
 from lumidock.reproduce.grid import FULL, QUICK, Grid
 from lumidock.reproduce.jobs import Progress, run_jobs
-from lumidock.reproduce.sections import sections_of
+from lumidock.reproduce.plan import Dock, Plan
+from lumidock.reproduce.tables import write_tables
 
-__all__ = ["FULL", "QUICK", "Grid", "reproduce"]
+__all__ = ["EXPERIMENTS", "FULL", "QUICK", "Dock", "Grid", "Plan", "reproduce"]
 
 
 def reproduce(
-    grid: Grid,
-    station_file: Path,
-    camera_file: Path,
-    out: Path,
+    plan: Plan,
     *,
+    only: Sequence[str] = (),
     force: bool = False,
     workers: int | None = None,
     progress: Progress = lambda _done, _total: None,
 ) -> dict[str, Any]:
-    """Run what is not in the folder `out` yet; writes report.html, tables.md and results.json there.
+    """Run what is not in the folder `plan.out` yet; writes report.html, tables.md, tables/ and results.json there.
 
-    Returns the results by job. The same grid, dock and version give the same numbers, times aside. Raises: InputError
-    for a folder that holds something else, unless `force`.
+    `only` are names of `EXPERIMENTS`; by default all are run. Returns the results by job. The same plan and version
+    give the same numbers, times aside. Raises: InputError for a folder that holds something else, unless `force`.
     """
-    _prepare(out, force)
-    dock = (str(station_file), str(camera_file))
-    digest = hashlib.sha256(station_file.read_bytes() + b"\0" + camera_file.read_bytes()).hexdigest()
+    jobs = jobs_of(plan, only)
+    _prepare(plan.out, force)
+    files = (Path(plan.dock.station), Path(plan.dock.camera))
+    digest = hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()
     workers = os.cpu_count() or 1 if workers is None else workers
-    jobs = jobs_of(grid, dock, out)
-    results = run_jobs(jobs, out / "results", digest, workers=workers, progress=progress)
-    sections = sections_of(grid, results, out)
-    lead = f"Both methods side by side on the {grid.name} grid, with the paper's own figures beside them."
-    page.write(out / "report.html", page.render("The paper's experiments, and what it left open", lead, sections))
-    write_whole(out / "tables.md", _tables(sections))
-    write_whole(out / "results.json", json.dumps(results, indent=1, sort_keys=True))
+    results = run_jobs(jobs, plan.out / "results", digest, workers=workers, progress=progress)
+    sections = sections_of(plan, results, only)
+    lead = f"The paper's method in two presets beside lumidock, with the paper's own figures; {plan.grid.name} grid."
+    text = page.render("The paper's experiments, and what it left open", lead, [section for _, section in sections])
+    page.write(plan.out / "report.html", text)
+    write_tables(sections, plan.out)
+    write_whole(plan.out / "results.json", json.dumps(results, indent=1, sort_keys=True))
     return results
 
 
@@ -59,13 +58,3 @@ def _prepare(out: Path, force: bool) -> None:
         raise InputError(f"{out}: exists and is no reproduction; give --force to write into it")
     out.mkdir(parents=True, exist_ok=True)
     write_whole(mark, json.dumps({"what": "lumidock reproduce"}))
-
-
-def _tables(sections: Sequence[PageSection]) -> str:
-    """All tables of the page as Markdown, under the titles of their sections."""
-    parts = []
-    for section in sections:
-        tables = [page.markdown(item) for item in section.items if isinstance(item, Table)]
-        if tables:
-            parts += [f"## {section.title}\n", *tables]
-    return "\n".join(parts)

@@ -9,10 +9,18 @@ import numpy as np
 from lumidock.report.page import Table
 from lumidock.sim.measured import measured_table
 
-_HEAD = ["pictures of", "frames", "lights", "missed, %", "error over sigma", "wrong layer, %", "false spots a frame"]
+_HEAD = [
+    "pictures of",
+    "frames",
+    "lights",
+    "missed, %",
+    "error over sigma",
+    "wrong layer, %",
+    "false detections a frame",
+]
 _CAPTION = (
-    "The default detector on rendered frames. {about} Lights up to {reach:g} m away, false spots of all frames; error "
-    "of the centre: rms of an axis over its own sigma, 1 where the covariance is right."
+    "The default detector on rendered frames. {about} Lights up to {reach:g} m away, false detections of all frames; "
+    "error of the centroid: rms of an axis over its own sigma, 1 where the covariance is right."
 )
 _REACH_M = 20.0
 

@@ -1,145 +1,78 @@
-"""The jobs of a reproduction."""
+"""The sections of a reproduction: the jobs of each, and what its part of the page shows."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
-from lumidock.reproduce import work
-from lumidock.reproduce.grid import Grid
+from lumidock.errors import InputError
+from lumidock.report.page import PageSection
+from lumidock.reproduce import (
+    ablations,
+    acquisition,
+    associations,
+    comparison,
+    docking,
+    envelope,
+    extraction,
+    hazards,
+    search,
+    summary,
+    swarm_figure,
+    table1,
+    tuning,
+)
 from lumidock.reproduce.jobs import Job
-from lumidock.reproduce.paper_figures import DISTANCES_M, TABLE_1
-from lumidock.sim.measured import measured_like
-from lumidock.sim.scenario import load_scenario, shipped_scenarios
+from lumidock.reproduce.plan import Plan
 
-ROWS = (*((*faults, False) for faults in TABLE_1), (1, 1, False), (1, 1, True), (3, 2, True))
-FAULTS_AT_DISTANCE = ((1, 0), (2, 0), (3, 0), (0, 1), (0, 2))
-COLD = {
-    "missing and spurious together": "missing-spurious",
-    "all of them beside the array": "beside",
-    "layer confusion: 30 % of the layer labels wrong": "joint",
-    "layer confusion: no labels at all": "joint-nocolor",
-    "no dock, only other lights": "clutter",
-    "only the mirror image in view": "mirror-only",
-}
-SWARM_ITERATIONS = [0, 1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120]
-_FRAME_S = {"rendered": 0.2, "paper": 0.08}  # about what a frame costs
-_APPROACH_M = 33.0
+Results = Mapping[str, Any]
 
 
-def jobs_of(grid: Grid, dock: work.Dock, out: Path) -> list[Job]:
-    """All jobs, in the order of the page."""
-    return [
-        *_table_1(grid, dock),
-        *_distances(grid, dock),
-        Job("figure-6", 5, work.swarm, (dock, grid.first_seed, SWARM_ITERATIONS)),
-        Job("figure-7-and-11", 5, work.backtracking, (dock, grid.first_seed)),
-        *_rendered(grid, dock, out),
-        *_cold(grid, dock),
-        *_envelope(grid, dock),
-        *_point_level(grid, dock),
-    ]
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """A section by the name that `--only` takes; its `jobs`, and the `section` that their results make."""
+
+    name: str
+    jobs: Callable[[Plan], list[Job]]
+    section: Callable[[Plan, Results], PageSection]
 
 
-def _table_1(grid: Grid, dock: work.Dock) -> list[Job]:
-    jobs = []
-    for missing, spurious, clean_start in ROWS:
-        for first in range(0, grid.trials, grid.trials_a_job):
-            seeds = (grid.first_seed + first, grid.first_seed + min(first + grid.trials_a_job, grid.trials))
-            name = f"table-1-{missing}-{spurious}{'-warm' * clean_start}-{seeds[0]}"
-            arguments = (dock, missing, spurious, *seeds, clean_start)
-            jobs.append(Job(name, 2.5 * (seeds[1] - seeds[0]), work.table_1, arguments))
-    return jobs
+EXPERIMENTS = (
+    Experiment("table-1", table1.jobs, table1.section),
+    Experiment("figure-6", swarm_figure.jobs, swarm_figure.section),
+    Experiment("figure-7-11", associations.filter_jobs, associations.filter_section),
+    Experiment("figure-9-10", associations.jobs, associations.section),
+    Experiment("search", search.jobs, search.section),
+    Experiment("docking", docking.jobs, docking.section),
+    Experiment("acquisition", acquisition.jobs, acquisition.section),
+    Experiment("comparison", comparison.jobs, comparison.section),
+    Experiment("ablations", ablations.jobs, ablations.section),
+    Experiment("tuning", tuning.jobs, tuning.section),
+    Experiment("extraction", extraction.jobs, extraction.section),
+    Experiment("envelope", envelope.jobs, envelope.section),
+    Experiment("hazards", hazards.jobs, hazards.section),
+)
 
 
-def _distances(grid: Grid, dock: work.Dock) -> list[Job]:
-    jobs = []
-    for z in DISTANCES_M:
-        for missing, spurious in FAULTS_AT_DISTANCE:
-            settings = [f"path.z_m={z}", f"path.count={grid.draws}", "detections.rear_range_m=0.01"]
-            settings += [f"faults.missing={missing}", f"faults.spurious={spurious}"]
-            name = f"figure-9-10-{z:g}-{missing}-{spurious}"
-            arguments = (dock, "missing-1", settings, grid.first_seed)
-            jobs.append(Job(name, 0.02 * grid.draws, work.acquisition_trial, arguments))
-    return jobs
+def chosen(only: Sequence[str]) -> list[Experiment]:
+    """The experiments by name, in the order of the page; all without a name. Raises: InputError for an unknown one."""
+    names = [experiment.name for experiment in EXPERIMENTS]
+    for name in only:
+        if name not in names:
+            raise InputError(f"--only {name}: no such section; there are {', '.join(names)}")
+    return [experiment for experiment in EXPERIMENTS if not only or experiment.name in only]
 
 
-def _rendered(grid: Grid, dock: work.Dock, out: Path) -> list[Job]:
-    """Dockings and the search; of the first docking the pictures stay, for the page."""
-    jobs = []
-    for seed in range(grid.dockings):
-        settings = [f"path.frame_interval_s={grid.docking_interval_s}"]
-        arguments = (
-            dock,
-            "approach",
-            settings,
-            grid.first_seed + seed,
-            str(out / "runs" / f"docking-{seed}"),
-            seed == 0,
-        )
-        jobs.append(Job(f"docking-{seed}", _cost(_APPROACH_M / grid.docking_interval_s), work.docking, arguments))
-    settings = [f"path.frame_interval_s={grid.search_interval_s}"]
-    arguments = (dock, "rectangle", settings, grid.first_seed, str(out / "runs" / "search"), False)
-    jobs.append(Job("search", _cost(63.0 / grid.search_interval_s), work.docking, arguments))
-    return jobs + _shipped(grid, dock, out)
+def jobs_of(plan: Plan, only: Sequence[str] = ()) -> list[Job]:
+    """The jobs of the chosen sections, in the order of the page."""
+    return [job for experiment in chosen(only) for job in experiment.jobs(plan)]
 
 
-def _shipped(grid: Grid, dock: work.Dock, out: Path) -> list[Job]:
-    """Shipped scenarios with a path, rendered: all of them, or on a coarser path those that the grid names."""
-    names, interval = list(grid.shipped), [f"path.frame_interval_s={grid.envelope_interval_s}"]
-    if grid.rendered_seeds:
-        names, interval = [n for n in shipped_scenarios() if load_scenario(n).path.kind != "draws"], []
-    return [
-        Job(
-            f"shipped-{name}-{seed}",
-            _cost(_APPROACH_M / (0.15 if grid.rendered_seeds else grid.envelope_interval_s)),
-            work.docking,
-            (dock, name, interval, grid.first_seed + seed, str(out / "runs" / f"{name}-{seed}"), False),
-        )
-        for name in names
-        for seed in range(max(grid.rendered_seeds, 1))
-    ]
-
-
-def _cost(frames: float) -> float:
-    return frames * (_FRAME_S["rendered"] + _FRAME_S["paper"])
-
-
-def _cold(grid: Grid, dock: work.Dock) -> list[Job]:
-    settings = [f"path.count={grid.draws}"]
-    return [
-        Job(f"cold-{scenario}", 0.05 * grid.draws, work.acquisition_trial, (dock, scenario, settings, grid.first_seed))
-        for scenario in COLD.values()
-    ]
-
-
-def _envelope(grid: Grid, dock: work.Dock) -> list[Job]:
-    """Waters x exposures, then light from above, then other salt and heat where the simulator knows of them."""
-    rows = [
-        (f"water-{name}-{exposure:g}", [f"water.kind={name}", f"sensor.exposure_ms={exposure}"])
-        for name in grid.waters
-        for exposure in grid.exposures_ms
-    ]
-    rows += [(f"daylight-{light:g}", [f"daylight.surface_w_m2={light}"]) for light in grid.daylight_w_m2]
-    rows.append(("salt-5-5", ["water.salinity_psu=5", "water.temperature_c=5"]))
-    interval = f"path.frame_interval_s={grid.envelope_interval_s}"
-    cost = _cost(_APPROACH_M / grid.envelope_interval_s)
-    return [
-        Job(f"envelope-{name.replace(' ', '-')}-{seed}", cost, work.envelope, (dock, [interval, *settings], seed))
-        for name, settings in rows
-        for seed in range(grid.first_seed, grid.first_seed + grid.envelope_seeds)
-    ]
-
-
-def _point_level(grid: Grid, dock: work.Dock) -> list[Job]:
-    """Every shipped scenario with a path, as bare detections by a detector that errs as it does on its pictures."""
-    jobs = []
-    for name in shipped_scenarios():
-        scenario = load_scenario(name)
-        if scenario.path.kind == "draws":
-            continue
-        settings = [f"detections.detector={measured_like(scenario)}"]
-        jobs += [
-            Job(f"point-{name}-{seed}", 2, work.campaign, (dock, name, settings, seed, seed + 1))
-            for seed in range(grid.first_seed, grid.first_seed + grid.point_seeds)
-        ]
-    return jobs
+def sections_of(plan: Plan, results: Results, only: Sequence[str] = ()) -> list[tuple[str, PageSection]]:
+    """The chosen sections by name, after a summary of what is in them."""
+    experiments = chosen(only)
+    sections = [(experiment.name, experiment.section(plan, results)) for experiment in experiments]
+    if {"table-1", "docking"} & {experiment.name for experiment in experiments}:
+        sections.insert(0, ("summary", summary.section(results)))
+    return sections

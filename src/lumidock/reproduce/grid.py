@@ -12,9 +12,15 @@ class Grid:
     """What is computed; seeds are consecutive from `first_seed`, and the same grid gives the same numbers."""
 
     name: str
-    trials: int  # of a row of Table 1
+    trials: int  # of a row of Table 1, on the dock as given
+    layout_trials: int  # the same, on the other layouts
     trials_a_job: int
-    draws: int  # poses at each distance, and of each cold start
+    table_interval_s: float  # between the rendered frames of Table 1
+    ablation_trials: int  # of each change, and of each size of the swarm
+    draws: int  # poses at each distance, and of each acquisition
+    compared: int  # frames of each condition that all baselines see
+    tuned: int  # candidates of the race for the swarm's coefficients; a power of two
+    extraction_frames: int  # at each distance, in each water
     dockings: int  # rendered approaches
     docking_interval_s: float
     search_interval_s: float
@@ -31,16 +37,22 @@ class Grid:
 
 QUICK = Grid(
     name="quick",
-    trials=6,
-    trials_a_job=3,
+    trials=4,
+    layout_trials=2,
+    trials_a_job=1,
+    table_interval_s=1.0,
+    ablation_trials=1,
     draws=100,
+    compared=40,
+    tuned=32,
+    extraction_frames=1,
     dockings=1,
     docking_interval_s=0.15,
     search_interval_s=1.0,
     waters=WATERS,
     exposures_ms=(2.0, 6.0),
     envelope_seeds=1,
-    envelope_interval_s=1.0,
+    envelope_interval_s=1.5,
     daylight_w_m2=(0.0, 600.0),
     shipped=("vehicle", "swapped-colors"),
     point_seeds=2,
@@ -49,8 +61,14 @@ QUICK = Grid(
 FULL = Grid(
     name="full",
     trials=30,
+    layout_trials=30,
     trials_a_job=2,
+    table_interval_s=0.15,
+    ablation_trials=30,
     draws=1000,
+    compared=500,
+    tuned=64,
+    extraction_frames=10,
     dockings=3,
     docking_interval_s=0.15,
     search_interval_s=0.5,

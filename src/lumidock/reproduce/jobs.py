@@ -22,16 +22,22 @@ Progress = Callable[[int, int | None], None]
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """`call(*arguments)` gives a result that JSON can hold; `name` is its file, `weight_s` about how long it takes."""
+    """`call(*arguments)` gives a result that JSON can hold; `name` is its file, `weight_s` about how long it takes.
+
+    `leaves` are files that it writes beside its result: where one is gone, the job is run again. `code` stands for the
+    code of methods that are not of this package.
+    """
 
     name: str
     weight_s: float
     call: Callable[..., dict[str, Any]]
     arguments: tuple[Any, ...]
+    leaves: tuple[Path, ...] = ()
+    code: str = ""
 
     def key(self, dock: str) -> str:
         """Stands for all that the result depends on: the source of the package, the arguments and the dock's files."""
-        what = f"{source_digest()} {dock} {self.name} {self.call.__name__} {self.arguments!r}"
+        what = f"{source_digest()} {dock} {self.code} {self.name} {self.call.__name__} {self.arguments!r}"
         return hashlib.sha256(what.encode()).hexdigest()[:24]
 
 
@@ -47,7 +53,8 @@ def run_jobs(
     results, todo = {}, []
     for job in jobs:
         before = read_json(out / f"{job.name}.json")
-        if before is not None and before.get("key") == job.key(dock):
+        whole = all(path.exists() for path in job.leaves)
+        if whole and before is not None and before.get("key") == job.key(dock) and "result" in before:
             results[job.name] = before["result"]
         else:
             todo.append(job)

@@ -21,3 +21,6 @@ DOCKING_PLANE_Z_M = -3.0  # section 4.2
 LAYER_OFFSET_M = 0.3  # section 4.2: the offset between the layers' centres stays below
 AXIS_M = 1.0  # section 4.2: the vehicle stays within this of the axis
 DUAL_LAYER_MS, SINGLE_LAYER_MS, FRAME_MS = 112.0, 97.0, 150.0  # section 4.2: detection and matching, and the budget
+# section 4.1: frames with all front lights; those with lights missing are not counted apart, so the first one stands
+TABLE_1_FRAMES = {(3, 0): 2108, (2, 0): 2108, (1, 0): 2108, (0, 1): 2076, (0, 2): 2153}
+SEARCH_Z_M = 15.0  # section 4.1 (3): the plane of the rectangular search

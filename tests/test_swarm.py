@@ -1,3 +1,5 @@
+"""The compiled swarm and the assignment inside it, against scipy and complex numbers."""
+
 import faulthandler
 
 import numpy as np
@@ -6,7 +8,8 @@ from conftest import assert_close
 from numpy.testing import assert_array_equal
 from scipy.optimize import linear_sum_assignment
 
-from lumidock.paper.swarm import assign, registration_cost, swarm
+from lumidock._kernels.assignment import assign
+from lumidock.paper.swarm import PointSets, Tuning, registration_cost, swarm
 
 LIGHTS = np.array([[-1, 0.55], [1, 0.5], [0.9, -0.6], [-0.8, -0.5], [0.1, 0.9], [0.3, -0.2]])
 NEW = np.full_like(LIGHTS, np.nan)  # no previous frame
@@ -64,12 +67,16 @@ def test_registration_cost_agrees_with_complex_numbers(rng):
     theta, s, tx, ty = x = np.array([0.3, 1.7, 0.2, -0.4])
     z = s * np.exp(1j * theta) * (seen @ [1, 1j])[:, None] + tx + 1j * ty
     expected = 2.0 * abs(z - lights @ [1, 1j]) + np.nan_to_num(0.3 * abs(z - previous @ [1, 1j]))
-    assert_close(registration_cost(x, seen, lights, previous, 2.0, 0.3), expected)
+    assert_close(registration_cost(x, PointSets(seen, lights, previous, np.nan), 2.0, 0.3), expected)
 
 
-def fly(seen, rng, *, previous=NEW, theta_previous=np.nan, size=(80, 120, 12)):
-    weights, coefficients = np.array([1.0, 0.3, 0.5]), np.array([2.5, 0.5, 1.5, 0.5])
-    return swarm(seen, LIGHTS, previous, theta_previous, LOW, HIGH, weights, 0.7, coefficients, 0.8, size, False, rng)
+def fly(seen, rng, *, previous=NEW, theta_previous=np.nan, size=(80, 120, 12), trace=None):
+    trace = np.full((size[1], size[0], 5), np.nan) if trace is None else trace
+    weights = {"w1": 1.0, "w2": 0.3, "penalty": 0.5, "inertia": 0.7, "k": 0.8}
+    falling = {"c1_base": 2.5, "c1_final": 0.5, "c2_base": 1.5, "c2_final": 0.5}
+    effort = {"particles": size[0], "iterations": size[1], "patience": size[2], "all_pairs": False}
+    sets = PointSets(seen, LIGHTS, previous, theta_previous)
+    return swarm(sets, Tuning(LOW, HIGH, **weights, **falling, **effort), rng, trace)
 
 
 def moved(points, theta, s, tx, ty):
@@ -84,7 +91,7 @@ def test_swarm_reports_the_cost_of_what_it_returns(theta_previous, previous, rng
     x, fitness = fly(seen, rng, previous=previous, theta_previous=theta_previous, size=(20, 10, 3))
     assert (x >= LOW).all()
     assert (x <= HIGH).all()
-    cost = registration_cost(x, seen, LIGHTS, previous, 1.0, 0.3)
+    cost = registration_cost(x, PointSets(seen, LIGHTS, previous, np.nan), 1.0, 0.3)
     turned_deg = np.rad2deg(abs(x[0] - theta_previous))
     penalty = 0.5 * (1 + (turned_deg - 10) / 5) if turned_deg >= 10 else 0.0
     assert_close(fitness, cost[linear_sum_assignment(cost)].sum() + penalty)
@@ -100,7 +107,7 @@ def test_swarm_finds_a_known_transform(n, rng):
     x, fitness = fly(seen, rng)
     assert_close(x, truth, atol=0.02)
     assert fitness < 0.02 * n
-    assert_array_equal(assign(registration_cost(x, seen, LIGHTS, NEW, 1.0, 0.3)), order)
+    assert_array_equal(assign(registration_cost(x, PointSets(seen, LIGHTS, NEW, np.nan), 1.0, 0.3)), order)
 
 
 def test_swarm_is_decided_by_its_seed(rng):
@@ -114,3 +121,15 @@ def test_a_longer_flight_is_never_worse(rng):
     seen = rng.normal(size=(5, 2))
     scores = [fly(seen, np.random.default_rng(1), size=(20, n, 3))[1] for n in (1, 1000)]
     assert scores[1] < scores[0]
+
+
+def test_the_trace_holds_every_particle_and_changes_nothing():
+    seen = LIGHTS[:5] * 0.8 + 0.1
+    trace = np.full((30, 20, 5), np.nan)
+    x, fitness = fly(seen, np.random.default_rng(3), size=(20, 30, 6), trace=trace)
+    bare, _ = fly(seen, np.random.default_rng(3), size=(20, 30, 6), trace=np.empty((0, 0, 5)))
+    assert_array_equal(x, bare)
+    assert fitness == trace[..., 4].min()
+    assert_array_equal(x, trace.reshape(-1, 5)[trace[..., 4].argmin(), :4])
+    assert (trace[..., :4] >= LOW).all()
+    assert (trace[..., :4] <= HIGH).all()
