@@ -65,9 +65,6 @@ def section(plan: Plan, results: Results) -> PageSection:
     )
     chosen = dict(zip(plan.methods, views, strict=True))
     shown = [one for name in ("paper", "lumidock") for one in annotated_images(chosen[name], _SHOWN_PICTURES)]
-        *annotated_images(chosen["paper"], _SHOWN_PICTURES),
-        *annotated_images(chosen["lumidock"], _SHOWN_PICTURES),
-    ]
     by_layer = [_figure_16(view, name) for name, view in chosen.items()]
     compared = [chosen["lumidock"], chosen["paper"]]
     trajectories = [figures.trajectory(chosen[name], f"docking-{name}") for name in ("lumidock", "paper")]
