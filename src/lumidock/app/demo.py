@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import numpy as np
+from typing_extensions import Self
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Fix, Frame, Image
