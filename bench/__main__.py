@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 from bench import (
+    acquisition,
     configuration,
     contact_sheet,
     detection,
@@ -20,6 +21,7 @@ from bench import (
     docks,
     doors,
     images,
+    nominal,
     rendering,
     reproduced,
     speed,
@@ -28,6 +30,8 @@ from bench import (
 )
 
 BENCHES = {
+    "acquisition": acquisition,
+    "nominal": nominal,
     "doors": doors,
     "table1": table1,
     "images": images,
@@ -62,7 +66,7 @@ def main() -> None:
 
 def between_marks(name: str) -> re.Pattern[str]:
     """The place of one table in a page; its groups are the marks before and after."""
-    return re.compile(rf"(<!-- {name} -->\n\n).*?(\n<!-- /{name} -->)", re.DOTALL)
+    return re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
 
 
 def into_docs(name: str, text: str) -> None:
@@ -70,7 +74,7 @@ def into_docs(name: str, text: str) -> None:
     found = False
     for page in (Path("README.md"), *sorted(Path("docs").glob("*.md"))):
         before = page.read_text(encoding="utf-8")
-        after, count = between_marks(name).subn(lambda m: f"{m[1]}{text}\n{m[2]}", before)
+        after, count = between_marks(name).subn(lambda m: f"{m[1]}\n{text}\n\n{m[2]}", before)
         found |= count > 0
         if after != before:
             page.write_text(after, encoding="utf-8")

@@ -57,7 +57,7 @@ def _section(model: type[BaseModel], path: str) -> Iterator[str]:
     """The table of a section, then those of the sections inside it."""
     if path:
         yield from (f"### `{path}`", "")
-    yield from (inspect.getdoc(model) or "", "")
+    yield from (*(inspect.getdoc(model) or "").splitlines(), "")
     inner = [(name, found) for name, field in model.model_fields.items() if (found := _model_of(field))]
     plain = [name for name in model.model_fields if name not in dict(inner)]
     if plain:
