@@ -1,1 +1,1 @@
-"""What the README's figures come from: `make bench`, or `python -m bench NAME` for one of them."""
+"""What the figures of README and docs/ come from: `make bench`, or `python -m bench NAME` for one of them."""

@@ -1,6 +1,6 @@
 """Run the benches named on the command line, or all; each leaves NAME.md and NAME.json in bench-out.
 
-With --readme each table also replaces its own in the README, between <!-- NAME --> and <!-- /NAME -->.
+With --docs each table also replaces its own in the documentation, between <!-- NAME --> and <!-- /NAME -->.
 """
 
 from __future__ import annotations
@@ -12,12 +12,16 @@ import time
 from pathlib import Path
 
 from bench import (
+    acquisition,
+    configuration,
     contact_sheet,
     detection,
     detector_errors,
     dockings,
+    docks,
     doors,
     images,
+    nominal,
     rendering,
     reproduced,
     speed,
@@ -26,6 +30,8 @@ from bench import (
 )
 
 BENCHES = {
+    "acquisition": acquisition,
+    "nominal": nominal,
     "doors": doors,
     "table1": table1,
     "images": images,
@@ -33,10 +39,12 @@ BENCHES = {
     "detection": detection,
     "detector-errors": detector_errors,
     "dockings": dockings,
+    "docks": docks,
     "visibility": visibility,
     "rendering": rendering,
     "reproduced": reproduced,
     "contact-sheet": contact_sheet,
+    "configuration": configuration,
 }
 
 
@@ -44,23 +52,34 @@ def main() -> None:
     """Run and print."""
     out = Path("bench-out")
     out.mkdir(exist_ok=True)
-    names = [name for name in sys.argv[1:] if name != "--readme"]
+    names = [name for name in sys.argv[1:] if name != "--docs"]
     for name in names or BENCHES:
         start = time.monotonic()
         content, lines = BENCHES[name].main()
         text = "\n".join(lines)
         (out / f"{name}.md").write_text(text + "\n", encoding="utf-8")
         (out / f"{name}.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        if "--readme" in sys.argv:
-            _into_readme(name, text)
+        if "--docs" in sys.argv:
+            into_docs(name, text)
         print(f"{text}\n({name}: {time.monotonic() - start:.0f} s)\n", flush=True)
 
 
-def _into_readme(name: str, text: str) -> None:
-    """Replace one table of the README."""
-    readme = Path("README.md")
-    between = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
-    readme.write_text(between.sub(lambda m: f"{m[1]}{text}\n{m[2]}", readme.read_text()), encoding="utf-8")
+def between_marks(name: str) -> re.Pattern[str]:
+    """The place of one table in a page; its groups are the marks before and after."""
+    return re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
+
+
+def into_docs(name: str, text: str) -> None:
+    """Replace one table wherever the documentation shows it. Raises: SystemExit where no page does."""
+    found = False
+    for page in (Path("README.md"), *sorted(Path("docs").glob("*.md"))):
+        before = page.read_text(encoding="utf-8")
+        after, count = between_marks(name).subn(lambda m: f"{m[1]}\n{text}\n\n{m[2]}", before)
+        found |= count > 0
+        if after != before:
+            page.write_text(after, encoding="utf-8")
+    if not found:
+        raise SystemExit(f"{name}: no page of the documentation has the mark <!-- {name} -->")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from lumidock.reproduce.detector import detector_table
 from lumidock.sim.frames import Shot
 from lumidock.sim.measured import KINDS, TABLE, measured_table, same_picture
 from lumidock.sim.scenario import Scenario, load_scenario, shipped_scenarios
-from lumidock.sim.schedule import Plan, exposed, schedule_of
+from lumidock.sim.schedule import Schedule, exposed, schedule_of
 from lumidock.sim.sequence import encoded
 from lumidock.streams.images import decode_image
 
@@ -108,7 +108,7 @@ def measure(scenario: Scenario) -> Cells:
     return cells
 
 
-def _frames(plan: Plan) -> Iterator[tuple[float, Frame, Shot, Indices]]:
+def _frames(plan: Schedule) -> Iterator[tuple[float, Frame, Shot, Indices]]:
     """Range of the dock m, picture, what was exposed and the dark lights of each frame."""
     for k, T_dock_cam in enumerate(plan.course.T_dock_cam):
         moment, studio = plan.moment(k), plan.studio(k)

@@ -9,15 +9,15 @@ import numpy as np
 from bench.shipped import shipped_camera, shipped_station
 from lumidock.sim.scenario import R_DOCK_CAM_HEAD_ON, load_scenario
 from lumidock.sim.schedule import schedule_of
+from lumidock.station import Station
 
 WATERS = ("IB", "II", "III", "1C", "3C", "5C", "7C", "pool-clear", "pool-murky")
 EXPOSURES_MS = (0.5, 2.0, 6.0)
 _SNR, _REACH_M = 8.0, (0.5, 120.0)
 
 
-def snr(settings: tuple[str, ...], layer: str, range_m: float) -> float:
+def snr(settings: tuple[str, ...], station: Station, layer: str, range_m: float) -> float:
     """Median matched-filter SNR of a layer's lights, seen head-on with the layer's middle at `range_m`."""
-    station = shipped_station()
     lights = station.lights_of(layer)
     plan = schedule_of(load_scenario("approach", settings), station, shipped_camera(), 0)
     T_dock_cam = np.eye(4)
@@ -28,12 +28,12 @@ def snr(settings: tuple[str, ...], layer: str, range_m: float) -> float:
     return float(np.median(shown.snr[inside])) if len(inside) else np.inf
 
 
-def reach_m(settings: tuple[str, ...], layer: str) -> float:
+def reach_m(settings: tuple[str, ...], station: Station, layer: str) -> float:
     """The range at which the median SNR has fallen to 8, by bisection."""
     low, high = _REACH_M
     while high - low > 0.02 * low:
         middle = float(np.sqrt(low * high))
-        low, high = (middle, high) if snr(settings, layer, middle) > _SNR else (low, middle)
+        low, high = (middle, high) if snr(settings, station, layer, middle) > _SNR else (low, middle)
     return low
 
 
@@ -45,7 +45,7 @@ def main() -> tuple[dict[str, object], list[str]]:
     for water in WATERS:
         fresh = ("water.salinity_psu=0",) if water.startswith("pool") else ()
         reach = [
-            reach_m((f"water.kind={water}", f"sensor.exposure_ms={ms}", *fresh), layer)
+            reach_m((f"water.kind={water}", f"sensor.exposure_ms={ms}", *fresh), shipped_station(), layer)
             for layer in ("front", "rear")
             for ms in EXPOSURES_MS
         ]

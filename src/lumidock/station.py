@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+from typing_extensions import Self
 
 from lumidock.alert_limits import DEFAULT_ALERT_LIMITS, AlertLimits, Band, GuideLimits
 from lumidock.datatypes import Array, Indices, require_shape

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
+from typing_extensions import Self
 
 from lumidock.alert_limits import DEFAULT_ALERT_LIMITS, AlertLimits
 from lumidock.datatypes import Array, Fix, Indices

@@ -144,7 +144,8 @@ def _guide_claims(path: Path, rows: list[Row], true: dict[str, Array], limits: A
 def _symmetric(triangles: Array) -> Array:
     """Matrices (N, 6, 6) of their upper triangles (N, 21), row by row."""
     upper = np.zeros((len(triangles), 6, 6))
-    upper[:, *np.triu_indices(6)] = triangles
+    rows, columns = np.triu_indices(6)
+    upper[:, rows, columns] = triangles
     return np.where(np.tri(6, k=-1, dtype=bool), upper.transpose(0, 2, 1), upper)
 
 

@@ -57,7 +57,12 @@ def phase_function(kind: str) -> tuple[Array, Array]:
     below = measured[0] * (angle / np.deg2rad(_ANGLE_DEG[0])) ** slope
     beta = np.exp(np.interp(np.log(angle), np.log(np.deg2rad(_ANGLE_DEG)), np.log(measured)))
     beta = np.where(angle < np.deg2rad(_ANGLE_DEG[0]), below, beta)
-    return angle, beta / float(np.trapezoid(2.0 * np.pi * beta * np.sin(angle), angle))
+    return angle, beta / float(integral(2.0 * np.pi * beta * np.sin(angle), angle))
+
+
+def integral(values: Array, at: Array) -> Array:
+    """Integral over the last axis by the trapezoidal rule; numpy 1 and 2 have it under different names."""
+    return np.asarray(((values[..., 1:] + values[..., :-1]) * np.diff(at, axis=-1)).sum(axis=-1) / 2.0)
 
 
 def phase_at(kind: str, angle_rad: Array) -> Array:
@@ -70,7 +75,7 @@ def backscatter_share(kind: str) -> float:
     """Share of the scattered light that goes backward."""
     angle, beta = phase_function(kind)
     back = angle > np.pi / 2.0
-    return float(np.trapezoid(2.0 * np.pi * (beta * np.sin(angle))[back], angle[back]))
+    return float(integral(2.0 * np.pi * (beta * np.sin(angle))[back], angle[back]))
 
 
 def _bessel_j0(x: Array) -> Array:
@@ -156,4 +161,4 @@ def _single(a: float, b: float, kind: str, distance_m: float, blur_rad: float) -
     rest = distance_m * np.sin(theta) / np.maximum(np.sin(alpha), 1e-12)
     way = np.clip(sight, 0.0, None) + rest
     light = phase_at(kind, alpha) * np.exp(-np.minimum((a + b) * way, 700.0))
-    return np.asarray(b * distance_m / np.sin(theta[:, 0]) * np.trapezoid(light, alpha, axis=1))
+    return np.asarray(b * distance_m / np.sin(theta[:, 0]) * integral(light, alpha))

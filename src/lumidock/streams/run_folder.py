@@ -11,9 +11,10 @@ import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
+from typing_extensions import Self
 
 from lumidock.datatypes import Array, Fix, Protection
 from lumidock.errors import InputError
@@ -208,8 +209,7 @@ def identities(files: Mapping[str, Path]) -> dict[str, dict[str, Any]]:
 
 def sha256(path: Path) -> str:
     """Hash of a file's content."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return hashlib.sha256(path.read_bytes()).hexdigest()  # at most _MOST_HASHED bytes
 
 
 def sha256_of_samples(path: Path, size: int) -> str:
