@@ -160,36 +160,39 @@ class PaperConfig(SettingsGroup):
 
 
 class DetectConfig(SettingsGroup):
-    """Light detection of the default method; figures without a source were set on rendered approaches."""
+    """Light detection of the default method: docs/detector.md derives each number or shows what it changes."""
 
-    contrast: PositiveFloat = 1.9  # sigmas by which a tile's largest pixel must clear that of the tiles around
-    min_snr: PositiveFloat = 6.0  # of a spot; a small one's is that of a matched filter
-    min_noise: PositiveFloat = 0.7  # steps of the sensor; rounding alone leaves 0.3
-    ring_px: PositiveFloat = 8.0  # radius of the ring that is a small spot's background; larger spots take 3 radii
-    max_detections: PositiveInt = 100  # in a frame; the strongest are kept
-    max_candidates: PositiveInt = 1500  # tiles looked at in a frame, the most outstanding ...
-    max_measured: PositiveInt = 300  # ... and those of them that are worth a measurement, the brightest
-    max_radius: Fraction = 0.06  # of the picture's longer side
-    min_radius_px: PositiveFloat = 0.9  # no lens makes a smaller spot
-    small_px: PositiveFloat = 3.2  # up to this radius the centre comes from the fit of a Gaussian
-    min_elongation: Fraction = 0.6  # shorter over longer axis of a round spot; below, its level is raised
-    min_fill: Fraction = 0.85  # area over that of the ellipse with the same moments
-    signal_noise: PositiveFloat = 0.01  # variance of a pixel per grey level of signal: shot noise, mosaic, JPEG
-    linear_noise: PositiveFloat = 0.024  # the same of mosaics and of 16 bits, which no gamma bends: 255 over 10.7 ke-
-    texture: PositiveFloat = 0.5  # share of its radius by which texture as strong as a spot moves the centre, 1 sigma
-    floor_px: PositiveFloat = 0.008  # 1 sigma of a centre that has no noise
-    coarse_px: PositiveFloat = 0.026  # the same where blue or red is brightest: JPEG has fewer samples of them
-    saturated_px: PositiveFloat = 0.025  # the same of a wide or saturated spot, over the root of its radius, in samples
-    cut: Fraction = 0.3  # 1 sigma, of the radius, of a centre whose spot the picture's edge cuts
-    glint_radii: PositiveFloat = 3.6  # a spot this near, in radii of the stronger one, ...
-    glint_ratio: PositiveFloat = 2.2  # ... with this many times less flux is a glint, ...
-    glint_trust: PositiveFloat = 0.5  # ... if the stronger looks like a lamp to this share of how much itself does
-    lamps: PositiveFloat = 16.0  # of a kind in view; more spots than that of one kind share the probability
-    prominent: Fraction = 0.1  # of the brightest; for spots with more flux a crowd says nothing
-    kin: PositiveFloat = 3.0  # spots are of a kind whose fluxes are within this factor
-    flux_range: PositiveFloat = 300.0  # of the lamps in one view; a spot fainter than that by the brightest is none
-    memory_s: PositiveFloat = 0.25  # an older frame says nothing of which spots are steady
-    drift_px_s: PositiveFloat = 400.0  # a lamp moves no faster over the picture, or counts as new
+    min_snr: PositiveFloat = 5.0  # of a blob's response, sigmas of its noise
+    clear: PositiveFloat = 2.0  # of a blob's response, sigmas of the texture around it
+    roundness: Fraction = 0.12  # smaller over larger curvature of a response; an edge or a rope has none
+    share: Fraction = 0.35  # of the strongest blob's height, that a more precise one of the same light must have
+    compact: Fraction = 0.05  # of its size, that counts as error where planes and scales compete for a light
+    reach: PositiveFloat = 1.2  # of its size, within which another blob is of the same light
+    wide: PositiveFloat = 3.0  # times larger, and a blob is a halo around others, ...
+    texture: Fraction = 0.5  # ... which are lights of their own if they have this share of its height
+    agree: PositiveFloat = 9.2  # chi-square, 2 dof, 1 %: planes whose centroids agree as well are averaged
+    texture_share: Fraction = 0.15  # of the texture around, that counts as noise of the centroid
+    spread: Fraction = (
+        0.25  # of the way of the maximum to the filters half an octave finer and wider, that is error, 1 sigma
+    )
+    lost: Fraction = 0.04  # of the filter's variance, that stands for this way where such a filter has no maximum
+    size_share: Fraction = 0.01  # of its size, that is error, 1 sigma
+    border_share: Fraction = 0.3  # of what a centroid is nearer to the border than 2.5 sizes, that is error, 1 sigma
+    mosaic_px: PositiveFloat = (
+        0.5  # error of a point in blue or red of a mosaic, whose samples lie two pixels apart, 1 sigma
+    )
+    floor_px: PositiveFloat = 0.04  # error of any centroid, 1 sigma
+    live_sigmas: PositiveFloat = 5.0  # by which a tile's brightest pixels must stand out
+    live_clear: PositiveFloat = 2.0  # the same, of the tiles around
+    live_least: PositiveFloat = 0.05  # least such sigma, grey levels
+    margin_px: PositiveInt = 24  # of picture around what is searched: 3 sigma of the widest Gaussian of the third level
+    window_sizes: PositiveFloat = 4.0  # the same in a tracked frame, in sizes of the largest lamp of the frame before
+    full_area_px: PositiveFloat = 6e5  # of the picture searched at full resolution; of more, coarser
+    window_area_px: PositiveFloat = 1e5  # the same of all windows of a tracked frame
+    square: PositiveFloat = 1.25  # ratio of the focal lengths up to which pixels count as square
+    min_p_light: Fraction = 0.01  # less is no detection: a frame of matter has hundreds, and they cost the matcher time
+    max_blobs: PositiveInt = 4000  # maxima of a frame, over all planes and scales
+    max_lights: PositiveInt = 200  # detections of a frame; the strongest are kept
 
 
 class LabelConfig(SettingsGroup):

@@ -20,6 +20,7 @@ Status = Literal["none", "acquired", "tracking", "coasting"]
 Stage = Literal["search", "front", "transition", "rear"]
 MOSAICS = ("bayer_rggb", "bayer_bggr", "bayer_grbg", "bayer_gbrg")
 ENCODINGS = tuple(f"{kind}{bits}" for kind in ("mono", "bgr", *MOSAICS) for bits in (8, 16))
+SATURATED = 250.0  # of 255, in a picture that uses them all: from this grey level on samples tell no more light
 MatchSource = Literal["pso", "btekf"]
 
 

@@ -1,157 +1,382 @@
-"""The lights in a frame: centres with their covariance, radii, fluxes, and how much each looks like a lamp.
+"""The lights in a frame: centroids with their covariance, radii, fluxes, and how likely each is a lamp.
 
-The whole frame is touched once, for the largest value of every 8 x 8 tile. Tiles that stand out of their surroundings
-are looked at in a window of their own. Mono, BGR and raw Bayer of 8 or 16 bits are taken as they come.
-
-The centre of a small light is the maximum-likelihood position of a round Gaussian on each colour's own samples:
-nothing is more precise on a spot of a few pixels, and it knows of the mosaic. Of a larger one, or one that is
-saturated, it is the balance of what stands over the level at which the spot is round and alone, which asks of the
-profile only that it is symmetric. Either comes with the covariance that the noise around the spot gives it, and what
-remains without noise.
-
-How much a spot looks like a lamp follows from its contrast, shape, size and blur, from what stands around it, and from
-whether it was there, as bright, in the frame before: snow and the images in a moving surface hardly ever are.
+A light is a maximum of a difference-of-Gaussians scale space in one of the planes blue, green, red and their mean. Its
+centroid is the maximum of that filter in the plane where it is most precise. Which steps there are, with which
+equations and why, is the subject of docs/detector.md.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from lumidock._kernels.detection import detect as kernels
-from lumidock._kernels.detection import fields, patch, tiles
-from lumidock._kernels.detection.samples import picture
-from lumidock._kernels.detection.saturation import SATURATED
+from lumidock import lamp
+from lumidock._kernels.detection import blobs, centroid, groups, live, profiles
+from lumidock._kernels.detection.canvas import Canvas, canvas
 from lumidock.config import DetectConfig
-from lumidock.datatypes import Array, Detections, Frame
+from lumidock.datatypes import SATURATED, Array, Detections, Frame, Image, Indices
+from lumidock.lamp import Seen
+from lumidock.picture import in_color
 
-_TWELVE_BITS = 16.0  # steps of a sensor of 12 bits in 16
-SWEEP = kernels.SWEEP
+_SCALES = 0.9 * np.sqrt(2.0) ** np.arange(3)  # standard deviations of the Gaussians, pixels of their level
+_TAPS = 3.0  # standard deviations on each side that a filter sums: 0.3 % of a Gaussian is beyond
+_SAMPLES = 1024  # responses whose median absolute value is the noise: known to 4 %
+_SIGMA = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
+_ROUNDING = 0.29 * 0.115  # noise that rounding to whole grey levels leaves in a response, times the scale
+_BORDER = 2.5  # sizes of a blob from the border, within which mirrored samples draw its centroid there
+_TINY = 1e-6  # px^2, that keep a covariance regular
+_COARSE = 3  # the level from which on the whole frame is searched: one pixel of it is a tile
+_LEAST_TOP = 160.0  # grey levels; nothing saturates lower
+_STEP, _PLATEAU, _FLATTER = 3.0, 16, 3  # grey levels that compression blurs; half-size pixels; times the next step's
 _LEAST_SIDE = 4  # pixels; in less nothing stands out
-_NOWHERE = np.empty((0, 3))
 
 
 class Scan:
-    """What is known of a camera's tiles: scratch and, between frames, the memory of a tracked search."""
+    """How a camera's frames are looked at and, from frame to frame, where they saturate and how large lights are.
 
-    def __init__(self, frame: Frame, config: DetectConfig) -> None:
-        """Make room for frames like this one."""
-        height, width = frame.image.shape[:2]
-        dtype = frame.image.dtype
-        h, w = -(-height // tiles.TILE_PX), -(-width // tiles.TILE_PX)
-        hb, wb = -(-h // tiles.BLOCK), -(-w // tiles.BLOCK)
-        self.like = (frame.image.shape, dtype, frame.encoding)
-        shown = picture(frame)
-        planes, channels = shown.planes, 3 if shown.planes == 3 else 1
-        maps = 1 if planes == 1 else 3
-        self.known = tiles.Map(
-            peak=np.zeros((maps, h, w), np.uint16),
-            raw_level=np.zeros((maps, hb, wb), np.uint16),
-            raw_sigma=np.zeros((hb, wb), np.float32),
-            by_plane=np.zeros((2, maps, hb, -(-wb // tiles.SPARSE)), np.float32),
-            level=np.zeros((maps, hb, wb), np.float32),
-            sigma=np.zeros((hb, wb), np.float32),
-            spread=np.ones(maps),
-            shared=np.ones(4),
-            line=np.empty((3, w * tiles.TILE_PX * channels * shown.deep), np.uint8),
-            difference=np.empty((2, w * tiles.TILE_PX * channels), np.int32),
-            middle=np.empty((tiles.BLOCK + 1, w), np.uint16),
-            ordered=np.empty(hb * wb + 4, np.float32),
-            top=np.zeros(tiles.TOPS, np.int32),
-            least=np.empty((2, w), np.int32),
-            worth=np.empty(w * tiles.TILE_PX, np.uint8),
-            seen=np.zeros((h, w), np.uint8),
-            found=np.empty((h * w, 5)),
-            queue=np.empty((2, h * w)),
-        )
-        self.close = patch.close_up()
-        least_noise = config.min_noise * (1.0 if dtype == np.uint8 else _TWELVE_BITS * shown.scale)
-        self.q = _parameters(config, max(height, width), least_noise, planes == 4 or dtype != np.uint8)
-        self.most = (config.max_candidates, config.max_measured)
-        self.spots, self.count = np.empty((config.max_detections, fields.COLUMNS)), 0
-        self.rects = np.empty((config.max_detections + 1, 4), np.int64)
-        self.past = np.empty((config.max_detections, fields.FLUX + 1))
-        self.part = -1  # of SWEEP, whose turn it is; nothing was seen yet
-        self.t_ns: int | None = None
-        self.saw_all = False
+    `aspect` is the camera's focal length in u over that in v, px: where the two are far apart, as in a single field of
+    interlaced video, the frame is stretched so that a round lamp is round.
+    """
+
+    def __init__(self, frame: Frame, config: DetectConfig, aspect: float = 1.0) -> None:
+        """For frames like this one."""
+        self.like = (frame.image.shape, frame.image.dtype, frame.encoding)
+        self.config = config
+        square = 1.0 / config.square < aspect < config.square
+        self.stretch = np.array([max(1.0 / aspect, 1.0), max(aspect, 1.0)]) if not square else np.ones(2)
+        self.forget()
 
     def fits(self, frame: Frame) -> bool:
         """Whether a frame is like those that this was made for."""
         return self.like == (frame.image.shape, frame.image.dtype, frame.encoding)
 
-    @property
-    def saturated(self) -> float:
-        """The grey level, of 255, from which on samples are saturated in the frames that were seen."""
-        return float(self.q[fields.CLIPPED])
-
     def forget(self) -> None:
-        """Drop what the frame before says of which spots are steady."""
-        self.t_ns = None
-
-    def since(self, t_ns: int, config: DetectConfig) -> tuple[float, bool]:
-        """How far, px, a lamp may have moved since the frame before, 0 if that is too long ago; whether it saw all."""
-        dt_s = (t_ns - self.t_ns) * 1e-9 if self.t_ns is not None else 0.0
-        return (config.drift_px_s * dt_s if 0.0 < dt_s <= config.memory_s else 0.0), self.saw_all
+        """Drop what the frames before say."""
+        self.saturated = SATURATED
+        self.size_px = 0.0
 
 
-def _parameters(config: DetectConfig, longer_side: int, least_noise: float, linear: bool) -> Array:
-    """The numbers that the kernel takes, in its order."""
-    q = np.empty(fields.PARAMETERS)
-    q[fields.CONTRAST], q[fields.MIN_SNR], q[fields.RING_PX] = config.contrast, config.min_snr, config.ring_px
-    q[fields.MAX_RADIUS_PX] = max(config.max_radius * longer_side, 2.0 * config.ring_px)
-    q[fields.MIN_RADIUS_PX], q[fields.SMALL_PX] = config.min_radius_px, config.small_px
-    q[fields.MIN_ELONGATION], q[fields.MIN_FILL] = config.min_elongation, config.min_fill
-    q[fields.SIGNAL_NOISE] = config.linear_noise if linear else config.signal_noise
-    q[fields.FLOOR_PX], q[fields.TEXTURE] = config.floor_px, config.texture
-    q[fields.SATURATED_PX], q[fields.CUT_SHARE] = config.saturated_px, config.cut
-    q[fields.GLINT_RADII], q[fields.GLINT_RATIO] = config.glint_radii, config.glint_ratio
-    q[fields.GLINT_TRUST], q[fields.CLIPPED], q[fields.MIN_NOISE] = config.glint_trust, SATURATED, least_noise
-    q[fields.PROMINENT], q[fields.COARSE_PX] = config.prominent, config.coarse_px
-    q[fields.KIN], q[fields.LAMPS], q[fields.RANGE] = config.kin, config.lamps, config.flux_range
-    return q
+class _Blobs(NamedTuple):
+    """Blobs: `rows` (N, columns of `blobs`), `uv` (N, 2) px, `cov` (N, 2, 2) px^2, measures (N, MEASURES)."""
+
+    rows: Array
+    cov: Array
+    measured: Array
 
 
-def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None, expected: Array | None = None) -> Detections:
-    """Find the lights of a frame: in all of it, or where they are expected and in the next part of the rest.
+def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None, predicted: Array | None = None) -> Detections:
+    """Find the lights of a frame: in all of it, or in windows around predicted ones.
 
-    `expected` (n, 3) u, v and reach px of the lights foretold, for a `scan` that has seen the frame before; the rest
-    comes round in `SWEEP` frames. The layer is not known yet. Takes any picture; one without lights gives no
+    `predicted` (n, 3) u, v and reach px. The layer is not known yet. Takes any picture; one without lights gives no
     detections.
     """
-    if min(frame.image.shape[:2]) < _LEAST_SIDE:
-        return _detections(frame, np.empty((0, fields.COLUMNS)))
     scan = scan if scan is not None and scan.fits(frame) else Scan(frame, config)
-    if expected is None:
-        scan.part, expected = -1, _NOWHERE
-    if len(scan.rects) <= len(expected) + scan.count:
-        scan.rects = np.empty((len(expected) + len(scan.spots) + 1, 4), np.int64)
-    scan.count, whole = kernels.see(
-        picture(frame),
-        scan.known,
-        scan.close,
-        scan.part,
-        expected,
-        scan.count,
-        scan.since(frame.t_ns, config),
-        scan.most,
-        scan.q,
-        scan.rects,
-        scan.past,
-        scan.spots,
-    )
-    scan.t_ns, scan.saw_all, scan.part = frame.t_ns, whole, 0 if whole else (scan.part + 1) % SWEEP
-    return _detections(frame, scan.spots[: scan.count])
+    if min(frame.image.shape[:2]) < _LEAST_SIDE:
+        return _none(frame)
+    found = seen(frame, scan, predicted)
+    return _none(frame) if found is None else _detections(frame, found, scan)
 
 
-def _detections(frame: Frame, spots: Array) -> Detections:
-    columns = spots.T.copy()
-    return Detections(
-        frame.name,
-        frame.t_ns,
-        spots[:, : fields.V + 1].copy(),
-        columns[fields.RADIUS],
-        columns[fields.FLUX],
-        columns[fields.P_LIGHT],
-        np.full(len(spots), np.nan),
-        spots[:, fields.VAR_UU : fields.VAR_VV + 1].copy().reshape(-1, 2, 2),
-        frame.attitude,
-    )
+def seen(frame: Frame, scan: Scan, predicted: Array | None = None) -> Seen | None:
+    """The blobs of `lights`, with what is known of each; in px of the frame as `scan` stretches it."""
+    image = _squared(in_color(frame), scan.stretch)
+    if predicted is None:
+        views = _everywhere(image, scan)
+    else:
+        views = _windows(image, predicted * [*scan.stretch, scan.stretch.max()], scan)
+    if not views:
+        return None
+    patches = np.concatenate([view.patches for view in views])
+    found = _blobs(views, patches, image.shape, scan.config)
+    if frame.encoding.startswith("bayer"):
+        _widen_sparse(found, scan.config.mosaic_px)
+    best = _one_per_light(found, image.shape, scan.config)
+    return _described(views, patches, best)
+
+
+def _none(frame: Frame) -> Detections:
+    nothing = np.empty(0)
+    uv, cov = np.empty((0, 2)), np.empty((0, 2, 2))
+    return Detections(frame.name, frame.t_ns, uv, nothing, nothing, nothing, nothing, cov, frame.attitude)
+
+
+def _squared(image: Image, stretch: Array) -> Image:
+    """The picture with pixels as wide as they are high."""
+    if (stretch == 1.0).all():
+        return image
+    height, width = image.shape[:2]
+    size = (round(width * stretch[0]), round(height * stretch[1]))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR))
+
+
+def _everywhere(image: Image, scan: Scan) -> list[Canvas]:
+    """The live tiles at fine levels, and all of the frame at coarse ones."""
+    config, (height, width) = scan.config, image.shape[:2]
+    whole = np.array([[0, 0, width, height]], np.int64)
+    margin = config.margin_px
+    if min(height, width) < 2 * live.TILE_PX:
+        return [canvas(image, 0, whole, margin, (0, _COARSE))]
+    pyramid = live.halvings(image, _COARSE)
+    scan.saturated = _saturation(pyramid[1])
+    if height * width <= config.full_area_px:
+        cores = whole
+    else:
+        cores = live.cores(image, pyramid[1], config.live_sigmas, config.live_clear, config.live_least)
+    top = max(_COARSE, int(math.log2(max(min(height, width) / 12.0, 1.0))))
+    coarse = canvas(pyramid[_COARSE - 1], _COARSE - 1, whole, margin, (_COARSE - 1, top))._replace(first=_COARSE)
+    if not len(cores):
+        return [coarse]
+    area = float(((cores[:, 2:] - cores[:, :2]) + 2 * margin).prod(axis=1).sum())
+    if area > height * width:
+        cores, area = whole, float(height * width)
+    base = _base(area, config.full_area_px)
+    return [coarse, canvas(image, 0, cores, margin, (base, _COARSE - 1))]
+
+
+def _base(area: float, most: float) -> int:
+    """The level at which an area has no more than so many pixels."""
+    return min(max(math.ceil(0.5 * math.log2(max(area / most, 1.0))), 0), _COARSE - 1)
+
+
+def _saturation(half: Image) -> float:
+    """The grey level, of 255, from which on samples are saturated: below the usual one in video of 16 to 235.
+
+    There the brightest pixels are many and alike; at the top of lights that are not saturated, as many pixels lie in
+    every step down.
+    """
+    scale = 1.0 if half.dtype == np.uint8 else 255.0 / 65535.0
+    top = scale * float(half.max())
+    if not _LEAST_TOP <= top < SATURATED:
+        return SATURATED
+    first, second = (int((half >= (top - k * _STEP) / scale).sum()) for k in (1, 2))
+    return top - 2.0 * _STEP if first >= max(_PLATEAU, _FLATTER * (second - first)) else SATURATED
+
+
+def _windows(image: Image, predicted: Array, scan: Scan) -> list[Canvas]:
+    """Windows around predicted lights, with room for lights of the size that there were."""
+    config, size_px, (height, width) = scan.config, scan.size_px, image.shape[:2]
+    margin = max(config.margin_px, int(config.window_sizes * size_px))
+    top = max(_COARSE - 1, math.ceil(math.log2(max(size_px, 1.0))))
+    low = np.floor(predicted[:, :2] - predicted[:, 2:]).astype(np.int64)
+    high = np.ceil(predicted[:, :2] + predicted[:, 2:]).astype(np.int64) + 1
+    cores = np.column_stack([np.maximum(low, 0), np.minimum(high, (width, height))])
+    cores = cores[(cores[:, 2:] > cores[:, :2]).all(axis=1)]
+    if not len(cores):
+        return []
+    area = float(((cores[:, 2:] - cores[:, :2]) + 2 * margin).prod(axis=1).sum())
+    base = min(_base(area, config.window_area_px), top)
+    return [canvas(image, 0, cores, margin, (base, max(top, base)))]
+
+
+def _blur(image: Array, sigma: float) -> Array:
+    taps = 2 * math.ceil(_TAPS * sigma) + 1
+    out = cv2.GaussianBlur(image, (taps, taps), sigma, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(out.reshape(image.shape))
+
+
+def _blobs(views: list[Canvas], patches: Indices, shape: tuple[int, ...], config: DetectConfig) -> _Blobs:
+    """Maxima over all planes, scales and levels, with their centroids."""
+    found, count, first = np.empty((config.max_blobs, blobs.COLUMNS)), 0, 0
+    for view in views:
+        last = first + len(view.patches)
+        where = _sampled(view.patches)
+        for k, image in reversed(list(enumerate(view.levels))):  # if room runs out, it is fine texture that is left out
+            level = view.base + k
+            if level < view.first:
+                continue
+            places = where[0] >> level, where[1] >> level
+            response = np.empty((*image.shape[:2], 4 if image.shape[2] == 3 else 1), np.float32)
+            fine = _blur(image, _SCALES[0])
+            for a, b in pairwise(_SCALES.tolist()):
+                wide = _blur(fine, math.sqrt(b * b - a * a))
+                blobs.differences(fine, wide, response)
+                noise = _noise(response[places], _ROUNDING / a)
+                least = config.min_snr * noise
+                count = blobs.maxima(
+                    response,
+                    least,
+                    noise,
+                    config.roundness,
+                    config.clear,
+                    level,
+                    a,
+                    patches,
+                    first,
+                    last,
+                    found,
+                    count,
+                )
+                fine = wide
+        first = last
+    rows = found[:count]
+    order = np.argsort(-rows[:, blobs.HEIGHT], kind="stable")
+    kept = np.ones(count)
+    groups.strongest(rows, _edge(rows, shape).min(axis=1), order, config.reach, config.wide, config.texture, kept)
+    return _measured(views, patches, rows[order[kept[order] > 0.0]], shape, config)
+
+
+def _noise(sampled: Array, least: float) -> Array:
+    """Standard deviation (P,) of responses (N, P), most of which are noise."""
+    away = np.sort(np.abs(sampled.T), axis=1)
+    return np.asarray(np.maximum(_SIGMA * away[:, away.shape[1] // 2], least), np.float64)
+
+
+def _sampled(patches: Indices) -> tuple[Indices, Indices]:
+    """Rows and columns of the canvas px, spread evenly over its patches."""
+    size = patches[:, 2:4] - patches[:, :2]
+    area = size.prod(axis=1)
+    ends = np.cumsum(area)
+    at = np.linspace(0, ends[-1] - 1, _SAMPLES).astype(np.int64)
+    k = np.searchsorted(ends, at, side="right")
+    inside = at - (ends[k] - area[k])
+    return patches[k, 1] + inside // size[k, 0], patches[k, 0] + inside % size[k, 0]
+
+
+def _edge(rows: Array, shape: tuple[int, ...]) -> Array:
+    """Distances (N, 2) px of blobs from the border in u and v."""
+    at = rows[:, [blobs.U, blobs.V]] + 0.5
+    return np.asarray(np.minimum(at, (shape[1], shape[0]) - at))
+
+
+def _measured(
+    views: list[Canvas], patches: Indices, rows: Array, shape: tuple[int, ...], config: DetectConfig
+) -> _Blobs:
+    """Their centroids and covariances; without those that are no maxima of the continuous filter."""
+    rows = _finer(views, rows)
+    out = np.zeros((len(rows), centroid.MEASURES))
+    for view, mine in _by_view(views, rows):
+        part, measured = rows[mine], out[mine]
+        for k, image in enumerate(view.levels):
+            centroid.centroids(image, patches, view.base + k, part, measured)
+        out[mine] = measured
+    holds = (out[:, centroid.M_OK] == 1.0) & (out[:, centroid.M_HEIGHT] > config.clear * rows[:, blobs.NOISE])
+    rows, out = rows[holds], out[holds]
+    pixel = 2.0 ** rows[:, blobs.LEVEL]
+    patch = patches[rows[:, blobs.PATCH].astype(np.int64)]
+    at = (out[:, [centroid.M_X, centroid.M_Y]] + 0.5) * pixel[:, None] - 0.5
+    rows[:, [blobs.U, blobs.V]] = at - patch[:, :2] + patch[:, 4:6]
+    rows[:, blobs.HEIGHT] = out[:, centroid.M_HEIGHT]
+    cov = _covariance(rows, out, pixel, config)
+    near = np.maximum(_BORDER * rows[:, [blobs.SIZE]] - _edge(rows, shape), 0.0)  # mirrored samples draw it there
+    for axis in range(2):
+        cov[:, axis, axis] += (config.border_share * near[:, axis]) ** 2
+    return _Blobs(rows, cov, out)
+
+
+def _by_view(views: list[Canvas], rows: Array) -> Iterator[tuple[Canvas, NDArray[np.bool_]]]:
+    """Each view with a mask (N,) of the blobs that lie on it."""
+    first = 0
+    for view in views:
+        last = first + len(view.patches)
+        yield view, (rows[:, blobs.PATCH] >= first) & (rows[:, blobs.PATCH] < last)
+        first = last
+
+
+def _widen_sparse(found: _Blobs, mosaic_px: float) -> None:
+    """Add to the covariance of small blobs in blue and red of a mosaic, of which every fourth pixel is a sample."""
+    size, plane = found.rows[:, blobs.SIZE], found.rows[:, blobs.PLANE]
+    sparse = np.where((plane == 0.0) | (plane == 2.0), mosaic_px**2 * np.exp(-0.5 * size**2), 0.0)
+    found.cov[:] += sparse[:, None, None] * np.eye(2)
+
+
+def _finer(views: list[Canvas], rows: Array) -> Array:
+    """The same blobs on the next finer level where there is one: its samples are dense enough for a Newton step."""
+    ends = np.cumsum([len(view.patches) for view in views])
+    bases = np.array([view.base for view in views])
+    base = bases[np.searchsorted(ends, rows[:, blobs.PATCH], side="right")]
+    finer = rows[:, blobs.LEVEL] > base
+    rows = rows.copy()
+    rows[finer, blobs.LEVEL] -= 1.0
+    rows[finer, blobs.SCALE] *= 2.0
+    rows[finer, blobs.X] = 2.0 * rows[finer, blobs.X] + 0.5
+    rows[finer, blobs.Y] = 2.0 * rows[finer, blobs.Y] + 0.5
+    return rows
+
+
+def _covariance(rows: Array, out: Array, pixel: Array, config: DetectConfig) -> Array:
+    """(N, 2, 2) px^2: noise and texture, the way of the maximum between scales, and a share of the size."""
+    xx, xy, yy = out[:, centroid.M_XX], out[:, centroid.M_XY], out[:, centroid.M_YY]
+    noise = rows[:, blobs.NOISE] ** 2 + (config.texture_share * rows[:, blobs.TEXTURE]) ** 2
+    cov = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2) * noise[:, None, None]
+    lost = (2.0 - out[:, centroid.M_SHIFTS]) * rows[:, blobs.SCALE] ** 2
+    for axis, shift in enumerate((centroid.M_SHIFT_X, centroid.M_SHIFT_Y)):
+        cov[:, axis, axis] += config.spread**2 * (out[:, shift] + config.lost * lost)
+    cov *= (pixel**2)[:, None, None]
+    rest = (config.size_share * rows[:, blobs.SIZE]) ** 2 + _TINY
+    return np.asarray(cov + rest[:, None, None] * np.eye(2))
+
+
+def _one_per_light(found: _Blobs, shape: tuple[int, ...], config: DetectConfig) -> _Blobs:
+    """The blob that stands for each light, the strongest first."""
+    rows = found.rows
+    order = np.argsort(-rows[:, blobs.HEIGHT], kind="stable")
+    var = 0.5 * (found.cov[:, 0, 0] + found.cov[:, 1, 1]) + (config.compact * rows[:, blobs.SIZE]) ** 2
+    best, partner = np.empty(len(rows) + 1, np.int64), np.empty((len(rows) + 1, 4), np.int64)
+    edge = _edge(rows, shape).min(axis=1)
+    count = groups.group(rows, edge, var, order, config.share, config.reach, best, partner)
+    best, partner = best[: min(count, config.max_lights)], partner[: min(count, config.max_lights)]
+    uv, cov = _fused(found, best, partner, config)
+    rows = rows[best]
+    rows[:, [blobs.U, blobs.V]] = uv
+    return _Blobs(rows, cov, found.measured[best])
+
+
+def _fused(found: _Blobs, best: Indices, partner: Indices, config: DetectConfig) -> tuple[Array, Array]:
+    """Centroids (n, 2) and covariances of lights: of the best blob, or of all planes that show the same core.
+
+    The estimates of blue, green and red are weighted by their inverse covariances where they agree with the best one.
+    """
+    uv, cov = found.rows[best][:, [blobs.U, blobs.V]], found.cov[best]
+    total, weighted = np.zeros_like(cov), np.zeros_like(uv)
+    for p in range(3):
+        k = partner[:, p]
+        at, its = found.rows[k][:, [blobs.U, blobs.V]], found.cov[k]
+        away = at - uv
+        agrees = np.einsum("ni,nij,nj->n", away, np.linalg.inv(cov + its), away) < config.agree
+        weight = np.where(((k >= 0) & agrees)[:, None, None], np.linalg.inv(its), 0.0)
+        total += weight
+        weighted += np.einsum("nij,nj->ni", weight, away)
+    known = np.linalg.det(total) > 0.0
+    total[~known] = np.linalg.inv(cov[~known])
+    fused = np.linalg.inv(total)
+    better = known & (np.trace(fused, axis1=1, axis2=2) < np.trace(cov, axis1=1, axis2=2))
+    uv[better] += np.einsum("nij,nj->ni", fused, weighted)[better]
+    cov[better] = fused[better]
+    return uv, cov + config.floor_px**2 * np.eye(2)
+
+
+def _described(views: list[Canvas], patches: Indices, best: _Blobs) -> Seen:
+    """The same with the rings around them."""
+    planes = 4 if views[0].levels[0].shape[2] == 3 else 1
+    rings = np.zeros((len(best.rows), 3, planes, profiles.RINGS))
+    xy = np.ascontiguousarray(best.measured[:, [centroid.M_X, centroid.M_Y]])
+    for view, mine in _by_view(views, best.rows):
+        part, its_rings = best.rows[mine], rings[mine]
+        for k, image in enumerate(view.levels):
+            profiles.rings(image, patches, view.base + k, part, xy[mine], its_rings)
+        rings[mine] = its_rings
+    return Seen(best.rows, best.cov, best.measured, rings)
+
+
+def _detections(frame: Frame, found: Seen, scan: Scan) -> Detections:
+    """What is said of them, in pixels of the frame as it came."""
+    p_light, radius_px, flux = lamp.likelihood(found), *lamp.radius_and_flux(found)
+    shown = p_light >= scan.config.min_p_light
+    p_light, radius_px, flux = p_light[shown], radius_px[shown], flux[shown]
+    found = Seen(*(part[shown] for part in found))
+    lamps = found.rows[p_light > 0.5, blobs.SIZE]
+    scan.size_px = float(lamps.max(initial=0.0))
+    high, wide = frame.image.shape[:2]
+    uv = (found.rows[:, [blobs.U, blobs.V]] + 0.5) / scan.stretch - 0.5
+    uv = np.clip(uv, -0.5, (wide - 0.5, high - 0.5))
+    cov = found.cov / (scan.stretch[:, None] * scan.stretch[None, :])
+    area = scan.stretch.prod()
+    unknown = np.full(len(uv), np.nan)
+    radius_px, flux = radius_px / np.sqrt(area), flux / area
+    return Detections(frame.name, frame.t_ns, uv, radius_px, flux, p_light, unknown, cov, frame.attitude)

@@ -7,11 +7,9 @@ from functools import cache
 
 import numpy as np
 
-from lumidock._kernels.detection.colors import colors
-from lumidock._kernels.detection.samples import picture
-from lumidock._kernels.detection.saturation import SATURATED
+from lumidock._kernels.detection.colors import colors, picture
 from lumidock.config import LabelConfig
-from lumidock.datatypes import Array, Detections, Frame, Indices
+from lumidock.datatypes import SATURATED, Array, Detections, Frame, Indices
 
 _OF_LETTER = {"b": 0, "g": 1, "r": 2}
 _LINEAR = np.empty(0, np.float32)  # raw mosaics are

@@ -50,7 +50,7 @@ class Localizer:
         if self.cold:
             self.forget()
         if self.scan is None or not self.scan.fits(frame):
-            self.scan = detect.Scan(frame, self.config.detect)
+            self.scan = detect.Scan(frame, self.config.detect, self.camera.focal_px[0] / self.camera.focal_px[1])
         predicted = tracking.predict(self.state, frame.t_ns, self.context)
         found = detect.lights(frame, self.config.detect, self.scan, predicted.windows())
         return self._step(layers.label(frame, found, self.config.label, self.scan.saturated), predicted)

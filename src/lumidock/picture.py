@@ -22,9 +22,14 @@ def encoding_of(frame: Frame) -> str:
     return frame.encoding or f"{'mono' if frame.image.ndim == 2 else 'bgr'}{bits}"
 
 
+def in_color(frame: Frame) -> Image:
+    """The picture of a frame at its own depth: (H, W) mono or (H, W, 3) BGR, a mosaic in its colours."""
+    if not frame.encoding.startswith("bayer") or min(frame.image.shape) < _LEAST_SIDE:
+        return frame.image
+    return np.asarray(cv2.cvtColor(frame.image, _TO_BGR[frame.encoding.removeprefix("bayer_")[:4]]))
+
+
 def developed(frame: Frame) -> Image:
     """The picture (H, W) mono8 or (H, W, 3) bgr8 of a frame: the upper 8 bits of 16, a mosaic in its colours."""
-    image = frame.image if frame.image.dtype == np.uint8 else (frame.image >> 8).astype(np.uint8)
-    if not frame.encoding.startswith("bayer") or min(image.shape) < _LEAST_SIDE:
-        return image
-    return np.asarray(cv2.cvtColor(image, _TO_BGR[frame.encoding.removeprefix("bayer_")[:4]]), np.uint8)
+    image = in_color(frame)
+    return image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)

@@ -1,16 +1,61 @@
-"""Colour of each spot: the light of blue, green and red over its background, read where the sensor is not saturated."""
+"""Colour of each light: what it has of blue, green and red over its background, where the sensor is not saturated."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from lumidock._kernels.compiling import entry, fast_part, part
-from lumidock._kernels.detection import samples
-from lumidock._kernels.detection.samples import Picture
-from lumidock.datatypes import Array, Indices
+from lumidock._kernels.compiling import entry, part
+from lumidock.datatypes import Array, Frame, Image, Indices
 
-_SAMPLES, _RIM_SAMPLES = 12, 9  # a side of a window at most: of the spot, and of its surroundings
+_SAMPLES, _RIM_SAMPLES = 12, 9  # a side of a window at most: of the light, and of its surroundings
 _CLIP_ROUNDS, _CLIP = 2, 2.5  # outliers of the background, in sigmas
+_SIXTEEN = 255.0 / 65535.0  # 8-bit levels of a 16-bit step
+
+
+class Picture(NamedTuple):
+    """A frame as the camera gives it, of any type.
+
+    `rows` (H, n) its bytes, `deep` of which are a sample, least byte first; `planes` 1, 3 or, for a mosaic, 4, of which
+    a sample, in a mosaic a 2 x 2 cell, has one value each; `scale` makes 8-bit grey levels of them.
+    """
+
+    rows: Image
+    deep: int
+    planes: int
+    scale: float
+    height: int
+    width: int
+
+
+def picture(frame: Frame) -> Picture:
+    """A frame as the kernels take it."""
+    image, (height, width) = np.ascontiguousarray(frame.image), frame.image.shape[:2]
+    planes = 4 if frame.encoding.startswith("bayer") else 3 if image.ndim == 3 else 1
+    deep = image.dtype.itemsize
+    rows = image.reshape(height, -1).view(np.uint8)
+    rows.flags.writeable = False  # or what is read only, as messages are, would be of another type, compiled anew
+    return Picture(rows, deep, planes, 1.0 if deep == 1 else _SIXTEEN, height, width)
+
+
+@part
+def value(picture: Picture, v: int, x: int) -> int:
+    """The `x`th number of row `v`."""
+    if picture.deep == 1:
+        return int(picture.rows[v, x])
+    return int(picture.rows[v, 2 * x]) + 256 * int(picture.rows[v, 2 * x + 1])
+
+
+@part
+def sample(picture: Picture, p: int, v: int, u: int) -> float:
+    """One sample of plane `p`, in grey levels, at a pixel or, on a mosaic, in the 2 x 2 cell of a pixel."""
+    if picture.planes == 1:
+        return picture.scale * value(picture, v, u)
+    if picture.planes == 3:
+        return picture.scale * value(picture, v, 3 * u + p)
+    v, u = min((v & -2) + (p >> 1), picture.height - 1), min((u & -2) + (p & 1), picture.width - 1)
+    return picture.scale * value(picture, v, u)
 
 
 @entry
@@ -79,10 +124,10 @@ def _add_disc(
                 continue
             most = 0.0
             for p in range(picture.planes):
-                most = max(most, samples.sample(picture, p, y, x))
+                most = max(most, sample(picture, p, y, x))
             if most < clipped:
                 for p in range(picture.planes):
-                    light[0, order[p]] += _light(samples.sample(picture, p, y, x), linear)
+                    light[0, order[p]] += _light(sample(picture, p, y, x), linear)
                     light[1, order[p]] += 1.0
 
 
@@ -95,7 +140,7 @@ def _rim(picture: Picture, order: Indices, linear: Array, u: float, v: float, ou
         for x in _steps(u, reach, picture.width, pitch, step):
             if (x - u) ** 2 + (y - v) ** 2 > 2.25 * outer * outer and count < rim.shape[1]:
                 for p in range(picture.planes):
-                    rim[order[p], count] = _light(samples.sample(picture, p, y, x), linear)
+                    rim[order[p], count] = _light(sample(picture, p, y, x), linear)
                 count += 1
     return count
 
@@ -136,12 +181,12 @@ def _is_burnt(picture: Picture, clipped: float, u: float, v: float, reach: float
         for x in range(max(int(u - reach), 0), min(int(u + reach) + 2, picture.width), step):
             if (x - u) ** 2 + (y - v) ** 2 <= reach * reach:
                 for p in range(channels):
-                    if samples.value(picture, y, channels * x + p) >= limit:
+                    if value(picture, y, channels * x + p) >= limit:
                         return True
     return False
 
 
-@fast_part
+@part
 def _clipped_moments(values: Array) -> tuple[float, float]:
     """Mean and standard deviation without outliers."""
     level, spread = 0.0, np.inf
