@@ -36,9 +36,9 @@ def found(image, config=CONFIG, scan=None, predicted=None):
     return detect.lights(Frame("f", 7, image), config, scan, predicted)
 
 
-def nearest(spots, u, v):
+def nearest(detections, u, v):
     """Index of the detection nearest to a place, and its error."""
-    error = spots.uv - (u, v)
+    error = detections.uv - (u, v)
     k = int(np.hypot(*error.T).argmin())
     return k, error[k]
 
@@ -49,10 +49,10 @@ def test_the_centroid_of_a_gaussian_is_unbiased_and_near_the_cramer_rao_bound(si
     rng, errors, nees = np.random.default_rng(4), [], []
     for seed in range(30):
         u, v = rng.uniform(100.0, 140.0, 2)
-        spots = found(water(seed, noise=2.0) + gauss(u, v, 40.0, sigma))
-        k, error = nearest(spots, u, v)
+        detections = found(water(seed, noise=2.0) + gauss(u, v, 40.0, sigma))
+        k, error = nearest(detections, u, v)
         errors.append(error)
-        nees.append(error @ np.linalg.solve(spots.cov_px2[k], error) / 2.0)
+        nees.append(error @ np.linalg.solve(detections.cov_px2[k], error) / 2.0)
     errors = np.array(errors)
     bound = np.sqrt(2.0 / np.pi * (2.0**2 + 1.0 / 12.0)) / 40.0
     assert np.abs(errors.mean(axis=0)).max() < 4.0 * errors.std() / np.sqrt(len(errors))
@@ -63,10 +63,10 @@ def test_the_centroid_of_a_gaussian_is_unbiased_and_near_the_cramer_rao_bound(si
 @pytest.mark.parametrize("radius", [3.0, 6.0, 12.0, 25.0])
 def test_an_overexposed_disc_has_its_centre_and_radius(radius):
     image = water() + disc(160.3, 120.7, radius)
-    spots = found(image)
-    k, error = nearest(spots, 160.3, 120.7)
+    detections = found(image)
+    k, error = nearest(detections, 160.3, 120.7)
     assert np.hypot(*error) < 0.1 + 0.01 * radius
-    assert spots.radius_px[k] == pytest.approx(radius, rel=0.3, abs=0.7)
+    assert detections.radius_px[k] == pytest.approx(radius, rel=0.3, abs=0.7)
 
 
 @settings(max_examples=12, deadline=None)
@@ -84,9 +84,9 @@ def test_a_picture_moved_by_whole_tiles_moves_its_lights(du, dv):
 @given(gain=st.floats(0.4, 1.0), offset=st.floats(0.0, 60.0))
 def test_gain_and_brightness_move_no_light(gain, offset):
     image = 40.0 + 0.0 * COLUMNS + gauss(160.2, 120.6, 120.0, 1.7) + gauss(80.1, 100.4, 80.0, 3.0)
-    spots = found(gain * image + offset)
+    detections = found(gain * image + offset)
     for place in ((160.2, 120.6), (80.1, 100.4)):
-        assert np.hypot(*nearest(spots, *place)[1]) < 0.05
+        assert np.hypot(*nearest(detections, *place)[1]) < 0.05
 
 
 @pytest.mark.parametrize("order", [(0, 2, 1), (1, 2, 0), (2, 1, 0)])
@@ -102,19 +102,19 @@ def test_planes_that_change_places_change_nothing(order):
 
 @pytest.mark.parametrize("place", [(1.0, 60.0), (318.0, 200.0), (160.0, 1.0), (100.0, 238.0), (2.0, 2.0)])
 def test_a_light_that_the_border_cuts_is_found(place):
-    spots = found(water() + gauss(*place, 150.0, 3.0))
-    k, error = nearest(spots, *place)
+    detections = found(water() + gauss(*place, 150.0, 3.0))
+    k, error = nearest(detections, *place)
     assert np.hypot(*error) < 3.0
-    assert error @ np.linalg.solve(spots.cov_px2[k], error) < 9.2
+    assert error @ np.linalg.solve(detections.cov_px2[k], error) < 9.2
 
 
 def test_halos_that_merge_leave_two_cores():
     image = water()
     for u in (150.3, 174.8):
         image += gauss(u, 120.6, 120.0, 2.5) + gauss(u, 120.6, 60.0, 14.0)
-    spots = found(image)
+    detections = found(image)
     for u in (150.3, 174.8):
-        assert np.hypot(*nearest(spots, u, 120.6)[1]) < 0.5
+        assert np.hypot(*nearest(detections, u, 120.6)[1]) < 0.5
 
 
 def test_a_compact_core_beside_a_white_panel_is_measured_in_the_plane_where_it_is_compact():
@@ -134,14 +134,14 @@ def test_a_compact_core_beside_a_white_panel_is_measured_in_the_plane_where_it_i
 def test_a_lamp_is_one_detection_in_all_planes_and_scales():
     light = gauss(160.2, 120.6, 200.0, 3.0) + gauss(160.2, 120.6, 50.0, 15.0)
     image = np.stack([water(k) + share * light for k, share in enumerate((1.0, 0.6, 0.3))], axis=2)
-    spots = found(to_picture(image))
-    assert (np.hypot(*(spots.uv - (160.2, 120.6)).T) < 10.0).sum() == 1
+    detections = found(to_picture(image))
+    assert (np.hypot(*(detections.uv - (160.2, 120.6)).T) < 10.0).sum() == 1
 
 
 @pytest.mark.parametrize("noise", [1.0, 5.0, 30.0])
 def test_noise_alone_gives_hardly_a_lamp(noise):
-    spots = found(water(5, 100.0, noise, (512, 612, 3)))
-    assert (spots.p_light > 0.5).sum() <= 1
+    detections = found(water(5, 100.0, noise, (512, 612, 3)))
+    assert (detections.p_light > 0.5).sum() <= 1
 
 
 @settings(max_examples=40, deadline=None)
@@ -160,12 +160,12 @@ def test_pictures_of_any_size_and_kind_are_taken(height, width, encoding, seed, 
     image.flags.writeable = False
     frame = Frame("f", 7, image, encoding=encoding)
     for predicted in (None, np.array([[width / 2.0, height / 2.0, 9.0], [-50.0, 0.0, 3.0]])):
-        spots = layers.label(frame, detect.lights(frame, CONFIG, None, predicted), LabelConfig())
-        assert np.isfinite(spots.uv).all()
-        assert (np.linalg.eigvalsh(spots.cov_px2) > 0.0).all()
-        assert ((spots.p_light >= 0.0) & (spots.p_light <= 1.0)).all()
-        assert (np.abs(spots.uv - (width / 2 - 0.5, height / 2 - 0.5)) <= (width / 2, height / 2)).all()
-        assert not flat or len(spots) == 0
+        detections = layers.label(frame, detect.lights(frame, CONFIG, None, predicted), LabelConfig())
+        assert np.isfinite(detections.uv).all()
+        assert (np.linalg.eigvalsh(detections.cov_px2) > 0.0).all()
+        assert ((detections.p_light >= 0.0) & (detections.p_light <= 1.0)).all()
+        assert (np.abs(detections.uv - (width / 2 - 0.5, height / 2 - 0.5)) <= (width / 2, height / 2)).all()
+        assert not flat or len(detections) == 0
 
 
 FORMATS = ("mono8", "mono16", "bgr8", "bgr16", *(f"{order}{bits}" for order in MOSAICS for bits in (8, 16)))
@@ -181,19 +181,19 @@ def test_every_format_gives_the_same_lights(kind):
     values = np.clip(np.rint(image * (257.0 if deep else 1.0)), 0, 65535 if deep else 255)
     values = values.astype(np.uint16 if deep else np.uint8)
     values = np.repeat(values[:, :, None], 3, axis=2) if kind.startswith("bgr") else values
-    spots = detect.lights(Frame("f", 7, values, encoding=kind), CONFIG)
+    detections = detect.lights(Frame("f", 7, values, encoding=kind), CONFIG)
     for place in places:
-        assert np.hypot(*nearest(spots, *place)[1]) < 0.12
+        assert np.hypot(*nearest(detections, *place)[1]) < 0.12
 
 
 def test_pixels_that_are_not_square_are_taken_into_account():
     """One field of interlaced video: half the rows, and lamps half as high as wide."""
     image = water() + gauss(160.2, 120.6, 120.0, 3.0, 1.5)
     frame = Frame("f", 7, to_picture(image))
-    spots = detect.lights(frame, CONFIG, detect.Scan(frame, CONFIG, aspect=2.0))
-    k, error = nearest(spots, 160.2, 120.6)
+    detections = detect.lights(frame, CONFIG, detect.Scan(frame, CONFIG, aspect=2.0))
+    k, error = nearest(detections, 160.2, 120.6)
     assert np.hypot(*error) < 0.1
-    assert spots.cov_px2[k, 0, 0] > 1.5 * spots.cov_px2[k, 1, 1]
+    assert detections.cov_px2[k, 0, 0] > 1.5 * detections.cov_px2[k, 1, 1]
 
 
 def test_windows_give_what_the_whole_frame_gives_and_nothing_else():
@@ -218,8 +218,8 @@ def test_the_covariance_grows_with_noise_and_with_texture():
         drawn = []
         for _ in range(6):
             u, v = rng.uniform(158.0, 162.0, 2)
-            spots = found(image + gauss(u, v, 60.0, 1.5) - 0.0)
-            drawn.append(np.sqrt(spots.cov_px2[nearest(spots, u, v)[0], 0, 0]))
+            detections = found(image + gauss(u, v, 60.0, 1.5) - 0.0)
+            drawn.append(np.sqrt(detections.cov_px2[nearest(detections, u, v)[0], 0, 0]))
         sigma[name] = np.median(drawn)
     assert sigma["noisy"] > 1.3 * sigma["calm"]
     assert sigma["textured"] > 1.15 * sigma["calm"]
@@ -265,9 +265,9 @@ def test_the_same_frame_gives_the_same_bytes():
 
 def test_name_stamp_and_attitude_pass_through():
     attitude = Attitude(np.eye(3), 0.01)
-    spots = detect.lights(Frame("f", 7, to_picture(water()), attitude), CONFIG)
-    assert (spots.frame, spots.t_ns, spots.attitude) == ("f", 7, attitude)
-    assert np.isnan(spots.p_rear).all()
+    detections = detect.lights(Frame("f", 7, to_picture(water()), attitude), CONFIG)
+    assert (detections.frame, detections.t_ns, detections.attitude) == ("f", 7, attitude)
+    assert np.isnan(detections.p_rear).all()
 
 
 def test_a_scan_made_for_another_camera_is_not_used():
@@ -286,26 +286,26 @@ def test_a_mosaic_tells_blue_from_white(order):
     white = np.tile(np.where(letters == "b", 0.5, 1.0), (120, 160))
     image = water() + gauss(80.2, 120.4, 120.0, 2.0) * white + gauss(240.7, 120.4, 120.0, 2.0) * blue
     frame = Frame("f", 7, to_picture(image), encoding=f"{order}8")
-    spots = layers.label(frame, detect.lights(frame, CONFIG), LabelConfig())
+    detections = layers.label(frame, detect.lights(frame, CONFIG), LabelConfig())
     for u, rear in ((80.2, False), (240.7, True)):
-        k, error = nearest(spots, u, 120.4)
+        k, error = nearest(detections, u, 120.4)
         assert np.hypot(*error) < 0.3
-        assert (spots.p_rear[k] > 0.5) == rear
+        assert (detections.p_rear[k] > 0.5) == rear
 
 
 def test_clear_water_makes_no_white_light_a_rear_one():
     image = water() + gauss(160.0, 120.0, 120.0, 3.0)
     linear = (np.clip(image, 0, 255) - 20.0)[:, :, None] * (1.1, 1.0, 0.6) + 20.0  # it has lost red, then green
     frame = Frame("0", 0, to_picture(255.0 * (np.clip(linear, 0.0, 255.0) / 255.0) ** (1.0 / 2.2)))
-    spots = layers.label(frame, detect.lights(frame, CONFIG), LabelConfig())
-    assert spots.p_rear[spots.flux.argmax()] < 0.5
+    detections = layers.label(frame, detect.lights(frame, CONFIG), LabelConfig())
+    assert detections.p_rear[detections.flux.argmax()] < 0.5
 
 
 def test_colour_without_light_says_nothing():
     frame = Frame("f", 7, to_picture(water(shape=(64, 64, 3))))
-    spots = detect.Detections.from_uv("f", 7, np.array([[30.0, 30.0]]))
-    spots = type(spots)("f", 7, spots.uv, np.array([1.5]), np.ones(1), np.ones(1), spots.p_rear)
-    assert np.isnan(layers.label(frame, spots, LabelConfig()).p_rear[0])
+    detections = detect.Detections.from_uv("f", 7, np.array([[30.0, 30.0]]))
+    detections = type(detections)("f", 7, detections.uv, np.array([1.5]), np.ones(1), np.ones(1), detections.p_rear)
+    assert np.isnan(layers.label(frame, detections, LabelConfig()).p_rear[0])
 
 
 def test_compression_and_saturation_leave_the_centre():

@@ -100,7 +100,7 @@ class BtekfConfig(SettingsGroup):
     """Backtracking EKF, paper section 3.2.3."""
 
     noise_in_gate: bool = True  # eq. (11), (12) print the gate without measurement noise
-    missing_branch: bool = True  # section 3.2.3 d prints none: every gated light must find its spot
+    missing_branch: bool = True  # section 3.2.3 d prints none: every gated light must find its detection
     gate: PositiveFloat = 13.8  # M^2 of eq. (12): chi-square, 2 dof, 99.9 %
     pixel_sigma: PositiveFloat = 1.0  # px, R of eq. (13)
     accept_px: PositiveFloat = 4.0  # reprojection residual after an update

@@ -44,7 +44,7 @@ def part(function: F) -> F:
 
 
 def fast_part(function: F) -> F:
-    """A `part` whose sums may be taken in any order and fused with products, so that several are taken at once."""
+    """A `part` whose sums may be added up in any order and fused with products: several additions run at once."""
     return register_jitable(error_model="numpy", fastmath={"reassoc", "contract"})(function)
 
 

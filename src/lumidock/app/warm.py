@@ -87,7 +87,7 @@ def _matching(station: Station, camera: Camera) -> None:
 
 
 def warm_up(process: Callable[[Frame], Fix], station: Station, camera: Camera) -> Iterator[tuple[str, Fix]]:
-    """Show the image door of a localizer, to be thrown away after, a drawn dock in every format of pixels.
+    """Let the `process` of a localizer see a drawn dock in every pixel format; the localizer is discarded afterwards.
 
     Yields each format and its last fix. What is compiled stays in this process and on disk.
     """
@@ -124,7 +124,7 @@ def _view(station: Station, camera: Camera, k: int) -> Array:
 
 
 def _picture(water: Array, uv: Array) -> Array:
-    """Levels (H, W), white 255, of spots in `water`."""
+    """Levels (H, W), white 255, of blobs in `water`."""
     image = water.copy()
     for u, v in uv:
         _add_blob(image, float(u), float(v))

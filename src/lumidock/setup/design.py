@@ -193,7 +193,7 @@ class _Judge:
     def _judged(self, u: Array, sets: list[int]) -> float:
         try:
             station = self.station(u)
-        except InputError:  # two lights at one place, or all on one spot
+        except InputError:  # two lights at one place, or all in one place
             return 10.0
         approach = replace(approach_of(self.spec, station), step_hz=_SEARCH_HZ)
         seen = seen_along(station, self.camera, approach)

@@ -1,6 +1,6 @@
 """Pixels as cameras and ROS lay them out in memory, into mono, BGR or a raw mosaic of 8 or 16 bits.
 
-Sources: sensor_msgs/image_encodings.hpp (ROS), the EMVA's Pixel Format Naming Convention 2.4 (GenICam: Mono12p,
+Sources: sensor_msgs/image_encodings.hpp (ROS), the EMVA's PFNC 2.4 (GenICam: Mono12p,
 Mono12Packed, BayerRG12p, ...), the MIPI CSI-2 specification (RAW10, RAW12), FourCC definitions of YUYV, UYVY, NV12.
 """
 

@@ -72,7 +72,7 @@ def colors(
     decide: tuple[float, float, float, float],
     p_rear: Array,
 ) -> None:
-    """Write `p_rear` (N,) of the spots `uv` (N, 2), by their light of B, G, R over the background.
+    """Write `p_rear` (N,) of the detections `uv` (N, 2), by their light of B, G, R over the background.
 
     `order` (4,): colour of each plane. `linear` (256,) undoes the camera's gamma. A saturated core is white whatever
     the lamp, so the ring around it is asked, from `clear_px` beyond its edge to `ring` radii + px. `decide`: see
@@ -133,7 +133,7 @@ def _add_disc(
 
 @part
 def _rim(picture: Picture, order: Indices, linear: Array, u: float, v: float, outer: float, rim: Array) -> int:
-    """Write the light of each colour in the surroundings of a spot to `rim` (3, N); returns how many samples."""
+    """Write the light of each colour in the surroundings of a detection to `rim` (3, N); returns how many samples."""
     pitch, reach, count = 2 if picture.planes == 4 else 1, 2.0 * outer + 2.0, 0
     step = pitch * (1 + int(2.0 * reach) // (_RIM_SAMPLES * pitch))
     for y in _steps(v, reach, picture.height, pitch, step):

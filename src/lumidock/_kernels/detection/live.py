@@ -1,4 +1,4 @@
-"""Where a frame is searched at full resolution: tiles whose brightest spot stands out of their surroundings."""
+"""Where a frame is searched at full resolution: tiles whose brightest pixels stand out of their surroundings."""
 
 from __future__ import annotations
 
