@@ -16,8 +16,8 @@ from bench import (
     detection,
     detector_errors,
     dockings,
-    doors,
     images,
+    process_detections,
     rendering,
     reproduced,
     speed,
@@ -26,7 +26,7 @@ from bench import (
 )
 
 BENCHES = {
-    "doors": doors,
+    "process-detections": process_detections,
     "table1": table1,
     "images": images,
     "speed": speed,

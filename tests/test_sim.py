@@ -92,7 +92,7 @@ def test_bad_settings_are_refused_in_one_line(setting):
     assert "\n" not in str(caught.value)
 
 
-def test_spots_have_the_truth_they_claim():
+def test_detections_lie_where_their_lights_truly_are():
     scenario = load_scenario("trials", ("faults.missing=2", "faults.spurious=3", "detections.noise_px=0.0"))
     for frame in simulated_frames(scenario, STATION, CAMERA, 4):
         named = frame.light >= 0
@@ -125,7 +125,7 @@ def test_rotations_are_those_of_one_at_a_time(rng):
 
 
 @pytest.mark.parametrize("name", ["nominal", "joint", "three-lights", "rectangle"])
-def test_truth_of_spots_is_the_projection_from_the_true_pose(name):
+def test_truth_of_detections_is_the_projection_from_the_true_pose(name):
     settings = ("detections.survey=false", "detections.calibration=false", "detections.noise_px=0")
     for frame in frames_of(name, *settings)[::7]:
         uv = project_lights(CAMERA, frame.T_dock_cam, STATION.p_dock)
@@ -159,9 +159,9 @@ def test_draws_are_spread_and_have_the_front_layer_in_view():
     assert 3.0 < tilt.max() <= np.hypot(3, 3) + 1e-6
     np.testing.assert_allclose(np.percentile(roll, [0, 50, 100]), [-3, 0, 3], atol=0.15)
     assert all(frame.in_view[:7].all() and not frame.in_view[7:].any() for frame in frames)
-    stray = np.concatenate([frame.detections.uv[frame.light < 0] for frame in frames])
-    assert CAMERA.contains(stray).all()
-    np.testing.assert_allclose(stray.mean(axis=0) / [CAMERA.width, CAMERA.height], 0.5, atol=0.02)
+    spurious = np.concatenate([frame.detections.uv[frame.light < 0] for frame in frames])
+    assert CAMERA.contains(spurious).all()
+    np.testing.assert_allclose(spurious.mean(axis=0) / [CAMERA.width, CAMERA.height], 0.5, atol=0.02)
     shares = np.bincount([len(named(frame)) for frame in frames], minlength=8)[4:7] / len(frames)
     np.testing.assert_allclose(shares, 1 / 3, atol=0.04)
     shares = np.bincount([(frame.light < 0).sum() for frame in frames], minlength=6)[1:] / len(frames)
@@ -202,9 +202,9 @@ def test_beside_is_beside():
     for frame in frames_of("beside", "path.count=100", "detections.noise_px=0"):
         corners = frame.uv[:7].min(axis=0), frame.uv[:7].max(axis=0)
         margin = 0.25 * (corners[1] - corners[0])
-        stray = frame.detections.uv[frame.light < 0]
-        assert len(stray) == 5
-        assert ((stray >= corners[0] - margin) & (stray <= corners[1] + margin)).all()
+        spurious = frame.detections.uv[frame.light < 0]
+        assert len(spurious) == 5
+        assert ((spurious >= corners[0] - margin) & (spurious <= corners[1] + margin)).all()
 
 
 def test_labels_are_wrong_and_lights_missing_as_often_as_asked():
