@@ -1,4 +1,4 @@
-"""The contact sheet of the README: rendered frames of the shipped dock by range and water, into docs/contact-sheet.jpg."""
+"""The contact sheet docs/contact-sheet.jpg: rendered frames of the shipped dock by range and water."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class Cell:
     detections: list[list[float]] = field(default_factory=list)
 
     def as_dict(self, most: int) -> dict[str, Any]:
-        """The entry of the file: detections in the order of error, false ones of p_light, evenly thinned out to `most`."""
+        """The entry of the file: at most `most` detections, evenly chosen in the order of error or p_light."""
         rows = sorted(self.detections, key=lambda row: row[1:3])
         if len(rows) > most:
             rows = [rows[i] for i in np.linspace(0, len(rows) - 1, most).round().astype(int)]

@@ -1,7 +1,7 @@
 """Every shipped docking, rendered in full, through the default method: where guide and pose begin, and gaps.
 
-All frames at 6.7 a second, two seeds per docking, on the station of the scenario: an hour of one core. Finished dockings
-stay in bench-out/dockings, from where the same command continues.
+All frames at 6.7 a second, two seeds per docking, on the station of the scenario: an hour of one core. Finished
+dockings stay in bench-out/dockings, from where the same command continues.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _COLUMNS = (
 
 
 def docking(scenario: str, seed: int, folder: str) -> dict[str, Any]:
-    """Figures of one docking: z of the first guide and of the first three consecutive valid poses, gaps, errors, hazards."""
+    """Figures of one docking: z of the first guide and of three consecutive valid poses, gaps, errors, hazards."""
     dock, place = (str(station_of(load_scenario(scenario))), str(CAMERA_FILE)), Path(folder)
     judged = work.docking(dock, scenario, [], seed, folder, keep=False, methods=("lumidock",))["lumidock"]
     figures = _figures(place / "lumidock", place / "sequence")

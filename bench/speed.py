@@ -1,7 +1,7 @@
 """Milliseconds from pixels to detections and to a fix, beside one pass over the frame and what others use; one core.
 
-Everything is timed in one process, in turns, in CPU time of the thread; before each timing the CPU caches are filled with
-other data. "passes" are multiples of the time of `np.max` over the same frame as mono.
+Everything is timed in one process, in turns, in CPU time of the thread; before each timing the CPU caches are filled
+with other data. "passes" are multiples of the time of `np.max` over the same frame as mono.
 """
 
 from __future__ import annotations

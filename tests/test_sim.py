@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bench.shipped import shipped_camera, shipped_station
+from bench.shipped import CAMERA_FILE, STATION_FILE, shipped_camera, shipped_station
 
 from lumidock.errors import InputError
+from lumidock.evaluation.campaign import plan
 from lumidock.geometry import so3_exp, so3_log
 from lumidock.pose import project_lights
 from lumidock.sim.detections import simulated_frames
@@ -17,9 +18,11 @@ from lumidock.sim.scenario import (
     load_scenario,
     rotations,
     shipped_scenarios,
+    station_of,
     trajectory,
 )
 from lumidock.sim.sequence import write_detections
+from lumidock.station import load_station
 
 STATION, CAMERA = shipped_station(), shipped_camera()
 
@@ -364,3 +367,26 @@ def test_detections_folder_says_what_was_seen(tmp_path):
     assert frames == len(read(tmp_path / "timestamps.csv"))
     assert sum(row["visible"] == "1" for row in truth) == len(detections)
     assert (tmp_path / "camera.yaml").exists()
+
+
+# Stations
+
+
+def test_a_scenario_is_simulated_on_the_station_that_it_is_made_for():
+    assert load_station(station_of(load_scenario("approach"))).name == STATION.name
+    assert {name: load_station(station_of(load_scenario(name))).name for name in ("plate", "funnel")} == {
+        "plate": "plate",
+        "funnel": "funnel-ring",
+    }
+    with pytest.raises(InputError, match="^approach: station mud is not shipped; there are cage-2x2x5, "):
+        station_of(load_scenario("approach", ("station=mud",)))
+
+
+def test_a_campaign_takes_each_scenarios_own_station_unless_one_is_given():
+    scenarios = [load_scenario("approach"), load_scenario("plate")]
+    own = plan(scenarios, ["lumidock"], (0, 1), None, CAMERA_FILE)
+    assert [shard.station.name for shard in own.shards] == [STATION.name, "plate"]
+    given = plan(scenarios, ["lumidock"], (0, 1), STATION_FILE, CAMERA_FILE)
+    assert [shard.station.name for shard in given.shards] == [STATION.name] * 2
+    assert own.shards[0].key == given.shards[0].key
+    assert own.shards[1].key != given.shards[1].key

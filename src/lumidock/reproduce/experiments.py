@@ -8,7 +8,7 @@ from lumidock.reproduce import work
 from lumidock.reproduce.grid import Grid
 from lumidock.reproduce.jobs import Job
 from lumidock.reproduce.paper_figures import DISTANCES_M, TABLE_1
-from lumidock.sim.measured import measured_like
+from lumidock.sim.measured import is_measured, measured_like
 from lumidock.sim.scenario import load_scenario, shipped_scenarios
 
 ROWS = (*((*faults, False) for faults in TABLE_1), (1, 1, False), (1, 1, True), (3, 2, True))
@@ -131,11 +131,11 @@ def _envelope(grid: Grid, dock: work.Dock) -> list[Job]:
 
 
 def _point_level(grid: Grid, dock: work.Dock) -> list[Job]:
-    """Every shipped scenario with a path, as bare detections by a detector that errs as it does on its pictures."""
+    """Bare detections with the measured errors of the detector, for every shipped scenario with a path that has them."""
     jobs = []
     for name in shipped_scenarios():
         scenario = load_scenario(name)
-        if scenario.path.kind == "draws":
+        if scenario.path.kind == "draws" or not is_measured(scenario):
             continue
         settings = [f"detections.detector={measured_like(scenario)}"]
         jobs += [

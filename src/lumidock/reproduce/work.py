@@ -27,7 +27,7 @@ from lumidock.paper.layer import LayerLocalizer
 from lumidock.pose import project_lights
 from lumidock.reproduce.trials import Counts, trial, trials_scenario, verdict
 from lumidock.sim.detections import SimulatedFrame, simulated_frames
-from lumidock.sim.scenario import Scenario, load_scenario, spurious_paths, trajectory
+from lumidock.sim.scenario import Scenario, load_scenario, spurious_paths, station_of, trajectory
 from lumidock.sim.sequence import file_of, render_frame, rendered
 from lumidock.sim.stream import Row
 from lumidock.station import Station, load_station
@@ -43,6 +43,11 @@ Pictures = list[tuple[Row, bytes]]  # a sequence in memory, as `rendered` gives 
 
 def _load(dock: Dock) -> tuple[Station, Camera]:
     return load_station(Path(dock[0])), load_camera(Path(dock[1]))
+
+
+def _dock_of(scenario: Scenario, dock: Dock) -> Dock:
+    """The station that a scenario names, in place of the one of the reproduction, and the camera."""
+    return (str(station_of(scenario)), dock[1]) if scenario.station else dock
 
 
 # At point level
@@ -74,6 +79,7 @@ def acquisition_trial(dock: Dock, scenario: str, settings: list[str], seed: int)
 def campaign(dock: Dock, scenario: str, settings: list[str], first: int, stop: int) -> dict[str, Any]:
     """Seeds of a shipped scenario at point level by our method: a row of a campaign's table."""
     loaded, tally = load_scenario(scenario, tuple(settings)), Tally()
+    dock = _dock_of(loaded, dock)
     for shard in plan([loaded], ["lumidock"], (first, stop), Path(dock[0]), Path(dock[1])).shards:
         tally.merge(Tally.from_dict(run_shard(shard)["tally"]))
     return row_of(tally)
@@ -92,8 +98,9 @@ def docking(
     methods: Sequence[str] = tuple(METHODS),
 ) -> dict[str, Any]:
     """Render a scenario in memory and run the methods on it, into `folder`; pictures only to `keep` land there."""
-    station, camera = _load(dock)
     loaded, place = load_scenario(scenario, tuple(settings)), Path(folder)
+    dock = _dock_of(loaded, dock)
+    station, camera = _load(dock)
     shutil.rmtree(place, ignore_errors=True)
     sequence = place / "sequence"
     sequence.mkdir(parents=True)
