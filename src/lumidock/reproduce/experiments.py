@@ -131,7 +131,7 @@ def _envelope(grid: Grid, dock: work.Dock) -> list[Job]:
 
 
 def _point_level(grid: Grid, dock: work.Dock) -> list[Job]:
-    """Bare detections with the measured errors of the detector, for every shipped scenario with a path that has them."""
+    """Bare detections with the measured errors of the detector, for each shipped scenario with a path that has them."""
     jobs = []
     for name in shipped_scenarios():
         scenario = load_scenario(name)
