@@ -21,6 +21,7 @@ from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Frame, Indices
 from lumidock.report import page
 from lumidock.reproduce.detector import detector_table
+from lumidock.sim.draws import Draw
 from lumidock.sim.frames import ExpectedFrame
 from lumidock.sim.measured import KINDS, TABLE, measured_table, same_picture
 from lumidock.sim.scenario import Scenario, load_scenario, shipped_scenarios, station_of
@@ -114,7 +115,9 @@ def _frames(schedule: Schedule) -> Iterator[tuple[float, Frame, ExpectedFrame, I
     for k, T_dock_cam in enumerate(schedule.course.T_dock_cam):
         conditions, renderer = schedule.conditions(k), schedule.renderer(k)
         expected = renderer.expect(conditions)
-        image = renderer.picture_of(expected, np.random.Generator(np.random.SFC64([schedule.seed, 9, k])))
+        image = renderer.picture_of(
+            expected, np.random.Generator(np.random.SFC64([schedule.seed, Draw.SENSOR_NOISE, k]))
+        )
         picture = decode_image(encoded(image, schedule.scenario.output), k)  # as the simulator's files hold it
         frame = Frame(f"{k:06d}", int(schedule.course.t_ns[k]), picture)
         yield float(np.linalg.norm(T_dock_cam[:3, 3])), frame, expected, conditions.dark

@@ -14,6 +14,7 @@ from lumidock.config import Config, ExtractConfig
 from lumidock.datatypes import Frame
 from lumidock.evaluation.metrics import evaluate, read_rows
 from lumidock.paper import PaperLocalizer, extract
+from lumidock.sim.draws import Draw
 from lumidock.sim.scenario import load_scenario, trajectory
 from lumidock.sim.sequence import render_frame, write_rendered
 from lumidock.streams.run_folder import RunFolder
@@ -62,7 +63,7 @@ def _maker(detection: dict[str, str], lights: dict[str, np.ndarray]) -> str:
 def rear_reach_m(gray: Literal["max", "luma"], seed: int) -> float:
     """Farthest z of the approach from which on, down to 4 m, all six rear lights are found in every third frame."""
     scenario, station, camera = load_scenario("approach"), shipped_station(), shipped_camera()
-    _, poses = trajectory(scenario, np.random.default_rng([seed, 0]))
+    _, poses = trajectory(scenario, np.random.default_rng([seed, Draw.COURSE]))
     rear, reach = station.lights_of("rear"), 4.0
     for number in [n for n in range(0, len(poses), 3) if 4.0 <= poses[n, 2, 3] < 17.0][::-1]:
         rng = np.random.default_rng([seed, number])

@@ -121,7 +121,7 @@ def test_each_light_and_detection_of_a_frame_is_counted():
     p_light, p_rear = np.array([0.9, 0.8, 1.0, 0.1, 0.2]), np.array([0.1, 0.2, 0.1, np.nan, 0.3])
     cov = np.tile(np.diag([0.25, 0.25]), (5, 1, 1))
     cov[1] = np.diag([0.01, 1.0])  # its error is along v
-    found = Detections("0", 0, uv, np.ones(5), np.ones(5), p_light, p_rear, cov)
+    found = Detections("0", 0, uv, np.ones(5), np.ones(5), p_light=p_light, p_rear=p_rear, cov_px2=cov)
     bench.add(cells, found, lit, injected, hot, 7.0)
     front, rear, false = cells["front"][1], cells["rear"][2], cells["false"][1]
     assert (front.of, rear.of, false.of) == (2, 2, 1)

@@ -89,7 +89,8 @@ def flown(a, b, distance_m, kind, edges_rad, photons=400_000, seed=1):
     angle, beta = phase_function(kind)
     density = 2.0 * np.pi * beta * np.sin(angle)
     cdf = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(angle))])
-    return fly(photons, a, b, distance_m, cdf / cdf[-1], angle, edges_rad, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    return fly(photons, a, b, distance_m, cdf=cdf / cdf[-1], angle=angle, edges=edges_rad, rng=rng)
 
 
 EDGES_DEG = np.array([0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0])

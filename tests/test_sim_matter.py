@@ -42,9 +42,15 @@ def water(beam=CLEAR):
     """Water at night."""
     none = np.zeros((2, 3))
     return Medium(
-        np.array(beam), np.zeros(3), np.ones(3), np.array([0.0, -1.0, 0.0]), 10.0, none, np.zeros((0, 2, 2, 3)),
-        np.zeros(0),
-    )  # fmt: skip
+        beam=np.array(beam),
+        surface=np.zeros(3),
+        decay=np.ones(3),
+        up=np.array([0.0, -1.0, 0.0]),
+        depth_m=10.0,
+        sideways=none,
+        lamp_sr=np.zeros((0, 2, 2, 3)),
+        edge_m=np.zeros(0),
+    )
 
 
 def seen(parts, finish, lights, medium=None, half=0.2, blocks=4, middle=(0.0, 0.0)):
@@ -57,8 +63,9 @@ def seen(parts, finish, lights, medium=None, half=0.2, blocks=4, middle=(0.0, 0.
     x, y = np.meshgrid(grid + middle[0], grid + middle[1])
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
     sight = kernel.Sight(rays, np.ones(x.shape), np.eye(3), 4.0 * half / blocks, 2.0 * half / side, float(kernel.BLOCK))
-    world = LitScene(solids, scene.surfaces(), lights, medium or water(), 1e-9,
-                  kernel.no_blockers(len(lights.exponent), len(solids.kind)), np.zeros((2, 2)))  # fmt: skip
+    world = LitScene(solids, scene.surfaces(), lights, medium or water(), faint=1e-9,
+                     blockers=kernel.no_blockers(len(lights.exponent), len(solids.kind)),
+                     noise=np.zeros((2, 2)))  # fmt: skip
     picture = kernel.Picture(
         np.empty((side, side, 3), np.float32), np.empty((side, side), np.float32),
         np.zeros((blocks, blocks, 3), np.float32),

@@ -16,6 +16,7 @@ from lumidock.camera import Camera
 from lumidock.datatypes import Array, Attitude, Detections, Indices
 from lumidock.pose import project_lights
 from lumidock.sim.course import Course, course_of, mirror_image, project_each, shines
+from lumidock.sim.draws import Draw
 from lumidock.sim.measured import Appearance, DetectionTable, as_measured, detector_errors, with_false
 from lumidock.sim.scenario import BlackOuts, Scenario, rotations, spurious_paths
 from lumidock.station import Station
@@ -81,22 +82,22 @@ def simulated_frames(scenario: Scenario, station: Station, camera: Camera, seed:
 
     Raises: InputError when no pose has the front layer in view.
     """
-    course = course_of(scenario, station, camera, np.random.default_rng([seed, 0]))
-    drawn = run_draws(scenario, station, course, np.random.default_rng([seed, 4]))
-    wander = _wandering(scenario, camera, course, np.random.default_rng([seed, 2]))
-    rng = np.random.default_rng([seed, 1])
+    course = course_of(scenario, station, camera, np.random.default_rng([seed, Draw.COURSE]))
+    drawn = run_draws(scenario, station, course, np.random.default_rng([seed, Draw.RUN]))
+    wander = _wandering(scenario, camera, course, np.random.default_rng([seed, Draw.WANDERING_LIGHTS]))
+    rng = np.random.default_rng([seed, Draw.DETECTIONS])
     uv, visible, range_m = _in_view_of_each(scenario, station, camera, course, drawn)
     lit = visible & ~_dark(scenario, station, course, drawn, visible, rng)
     spurious = _spurious(scenario, drawn, wander, _box(scenario, camera, uv, visible), rng)
     errors = detector_errors(scenario.detections.detector) if scenario.detections.detector else None
-    detector_rng = np.random.default_rng([seed, 15])
+    detector_rng = np.random.default_rng([seed, Draw.DETECTOR_ERRORS])
     if errors:
         lit &= errors.found(_is_rear(station), range_m, detector_rng)
     table = _table(uv, lit, spurious, range_m, scenario.shows_dock)
     if errors:
         dock_m = np.linalg.norm(course.T_dock_cam[:, :3, 3], axis=1)
         table = with_false(table, errors, np.where(drawn.black, np.nan, dock_m), camera, detector_rng)
-    attitudes = _attitudes(scenario, course, np.random.default_rng([seed, 5]))
+    attitudes = _attitudes(scenario, course, np.random.default_rng([seed, Draw.ATTITUDE]))
     if not scenario.shows_dock:
         uv, visible = _pixels_of_hidden_dock(scenario, camera, course, drawn, uv), np.zeros_like(visible)
     noise = rng.normal(0.0, 1.0, table.uv.shape) * scenario.detections.noise_px

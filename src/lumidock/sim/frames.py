@@ -12,6 +12,7 @@ from lumidock.datatypes import Array, Indices
 from lumidock.geometry import se3_exp, se3_inverse, se3_log, transform_points
 from lumidock.sim import surroundings
 from lumidock.sim.canvas import Canvas, Core, Mosaic
+from lumidock.sim.draws import Draw
 from lumidock.sim.knobs import Fish, WaterSurface
 from lumidock.sim.lens import Lens
 from lumidock.sim.matter_renderer import MatterRenderer, compact_points, visible_share
@@ -53,9 +54,9 @@ class FrameConditions:
         way = se3_log(self.T_cam_later) * (lapse_s / self.exposure_s)
         return replace(self, t_s=self.t_s + lapse_s, T_dock_cam=self.T_dock_cam @ se3_exp(way))
 
-    def rng(self, what: int) -> np.random.Generator:
-        """A generator that gives the same draws in every frame of a run; `what` is the number of the purpose."""
-        return np.random.default_rng([*self.draws, what])
+    def rng(self, purpose: Draw) -> np.random.Generator:
+        """A generator that gives the same draws in every frame of a run."""
+        return np.random.default_rng([*self.draws, purpose])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +83,7 @@ class FrameRenderer:
         self.matter_renderer = (
             MatterRenderer(scenario, station, lens, self.canvas.colors) if scenario.matter.is_present else None
         )
-        self.hot_at, self.hot_e_s = hot_pixels(scenario.sensor, shape, np.random.default_rng([*draws, 20]))
+        self.hot_at, self.hot_e_s = hot_pixels(scenario.sensor, shape, np.random.default_rng([*draws, Draw.HOT_PIXELS]))
 
     @cached_property
     def lamp_sr(self) -> Array | None:
@@ -121,7 +122,9 @@ class FrameRenderer:
         """Draw the solids; returns the emitters without what solids hide, and compact bright points (R, 2) px."""
         moves = self.scenario.lens.motion
         later = conditions.T_cam_later if moves else np.eye(4)
-        drawn = matter_renderer.draw(self._exposure(conditions), conditions.p_dock, watts, later, conditions.rng(21))
+        drawn = matter_renderer.draw(
+            self._exposure(conditions), conditions.p_dock, watts, later, conditions.rng(Draw.JELLYFISH)
+        )
         self.canvas.mosaic[...] = drawn.electrons
         self.canvas.range_m = drawn.range_m
         share = visible_share(drawn.solids, emitters, self.scenario.lamps.window_radius_m)
@@ -147,15 +150,17 @@ class FrameRenderer:
         parts = [replace(own, lit=own.lit & shining & conditions.dock)]
         watts = watts * shining[:, None]
         if conditions.surface is not None:
-            n, rng = green_index(scenario.water), conditions.rng(11)
+            n, rng = green_index(scenario.water), conditions.rng(Draw.MIRROR_IMAGES)
             own_lamps = surroundings.LampSet(station, p_dock, watts, radius_m)
             parts += surroundings.mirrored(conditions.surface, n, exposure, own_lamps, rng)
         if knobs.glints is not None and conditions.dock:
-            parts.append(surroundings.glints(knobs.glints, exposure, station, p_dock, watts, conditions.rng(12)))
+            parts.append(
+                surroundings.glints(knobs.glints, exposure, station, p_dock, watts, conditions.rng(Draw.GLINTS))
+            )
         if knobs.vehicle is not None:
             parts.append(surroundings.vehicle(knobs.vehicle, exposure, radius_m))
         if knobs.snow is not None:
-            parts.append(surroundings.snow(knobs.snow, scenario, exposure, conditions.rng(13)))
+            parts.append(surroundings.snow(knobs.snow, scenario, exposure, conditions.rng(Draw.SNOW)))
         if len(conditions.spurious):
             parts.append(_spurious(own, conditions.spurious))
         return joined(parts), watts * conditions.dock
@@ -224,7 +229,7 @@ def _fill_ellipse(mask: np.ndarray, center: tuple[int, int], semi_axes: tuple[in
 
 def _draw_fish(mask: np.ndarray, knobs: Fish, focal_px: float, conditions: FrameConditions) -> None:
     """Mark the pixels that fish hide; each fish crosses the picture repeatedly."""
-    rng, (height, width) = conditions.rng(14), mask.shape
+    rng, (height, width) = conditions.rng(Draw.FISH), mask.shape
     for _ in range(knobs.count):
         far, length, speed = (rng.uniform(*reach) for reach in (knobs.distance_m, knobs.length_m, knobs.speed_m_s))
         half, way = 0.5 * length * focal_px / far, width + 2.0 * length * focal_px / far

@@ -27,17 +27,17 @@ from lumidock.station import Station
 _MOST_SAMPLES = 2.0e6  # small pictures are rendered at twice their size up to this; less aliasing of thin bodies
 _FAINT_E = 0.25  # lamps that add less than this many electrons to a pixel get no shadows
 _COSINES = 512  # angles to the vertical at which scattered daylight is tabulated
-_RINGS_M = 4  # layers of range for which forward scattering of light from solids is computed
+_RANGE_LAYERS = 4  # layers of range for which forward scattering of light from solids is computed
 _WINDOW = 7  # points of a lamp's window that are tested for visibility
 _NOISE = np.random.default_rng(0).uniform(-1.0, 1.0, (128, 128))  # of which stains are made
-_STILL_PX = 0.3  # motion during the exposure below which no blur is computed, px
-_ROUND = 0.14  # least determinant over squared trace of the Hessian: curvatures in a ratio of 5
+_NO_MOTION_PX = 0.3  # motion during the exposure below which no blur is computed, px
+_LEAST_ROUNDNESS = 0.14  # least determinant over squared trace of the Hessian: curvatures in a ratio of 5
 _POINT_SIGMAS, _MOST_POINTS = (0.8, 2.4), 100  # of the difference of Gaussians, in cells; most points per picture
 _MOUNT_M = 0.03  # solids this close to a lamp are its mount and do not hide it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
+class MatterImage:
     """Electrons (H, W) of solids and water on the mosaic, ranges (H, W) m of the solids, and the solids in `cam`."""
 
     electrons: Array
@@ -81,7 +81,7 @@ class MatterRenderer:
 
     def draw(
         self, exposure: Exposure, p_dock: Array, watts: Array, T_cam_later: Array, rng: np.random.Generator
-    ) -> Drawn:
+    ) -> MatterImage:
         """Render one frame with M lamps at `p_dock` (M, 3), of power `watts` (M, 3) W in each band.
 
         `T_cam_later` (4, 4) is the camera's motion during the exposure.
@@ -153,12 +153,12 @@ class MatterRenderer:
             edge_m=surroundings.LAMP_EDGES_M if len(self._lamp_sr) else np.zeros(0),
         )
 
-    def _on_mosaic(self, picture: kernel.Picture, solids: Solids, smear: Array) -> Drawn:
+    def _on_mosaic(self, picture: kernel.Picture, solids: Solids, smear: Array) -> MatterImage:
         """Blur by motion and lens, resample to pixels, select each pixel's channel, and add light scattered forward."""
         camera, knobs = self.lens.camera, self.lens.knobs
         spread = self._spread(picture.cells, picture.range_m)
         electrons: Array = picture.electrons
-        if np.hypot(*smear) > _STILL_PX:
+        if np.hypot(*smear) > _NO_MOTION_PX:
             electrons = np.asarray(cv2.filter2D(electrons, -1, _line(smear), borderType=cv2.BORDER_REPLICATE))
         blurred = self._cropped(np.asarray(cv2.GaussianBlur(electrons, (0, 0), knobs.blur_px * self.scale)))
         range_m = self._cropped(picture.range_m)
@@ -175,7 +175,7 @@ class MatterRenderer:
                 plane = _sampled(light[:, :, channel], mosaic[at].shape, step * self.scale / self._stride, row, column)
                 plane *= np.minimum(range_m[at] * np.float32(1.0 / source_m), np.float32(1.0))
                 mosaic[at] += plane
-        return Drawn(mosaic, np.ascontiguousarray(range_m), solids)
+        return MatterImage(mosaic, np.ascontiguousarray(range_m), solids)
 
     def _cropped(self, samples: Array) -> Array:
         """The samples inside the picture, as blocks extend beyond it."""
@@ -197,7 +197,7 @@ class MatterRenderer:
         solid = far < FAR_M
         if not solid.any():
             return []
-        edges = np.geomspace(far.min(), 1.001 * max(float(far[solid].max()), float(far.min()) + 0.1), _RINGS_M + 1)
+        edges = np.geomspace(far.min(), 1.001 * max(float(far[solid].max()), float(far.min()) + 0.1), _RANGE_LAYERS + 1)
         pixel_rad = float(np.sqrt(self.lens.solid_angle(self.lens.camera.center_px[None])[0])) / self.scale
         spread = []
         for near, end in pairwise(edges):
@@ -255,7 +255,7 @@ def compact_points(electrons: Array, read_noise_e: float) -> Array:
     apart = narrow - wide
     noise = np.sqrt(np.maximum(wide, 0.0) + read_noise_e**2)
     uu, vv, cross = (cv2.Sobel(apart, -1, dx, dy, ksize=3) for dx, dy in ((2, 0), (0, 2), (1, 1)))
-    ridge = uu * vv - cross * cross < _ROUND * (uu + vv) ** 2
+    ridge = uu * vv - cross * cross < _LEAST_ROUNDNESS * (uu + vv) ** 2
     peaks = (
         ~ridge & (apart == cv2.dilate(apart, np.ones((5, 5), np.uint8))) & (apart > np.maximum(4.0 * noise, 0.2 * wide))
     )

@@ -12,6 +12,7 @@ from lumidock.datatypes import Array, Indices
 from lumidock.geometry import se3_exp, se3_inverse, se3_log
 from lumidock.sim.course import Course, course_of
 from lumidock.sim.detections import RunDraws, dark_lights, failed, in_view, run_draws
+from lumidock.sim.draws import Draw
 from lumidock.sim.frames import FrameConditions, FrameRenderer
 from lumidock.sim.knobs import AutoExposure, WaterSurface
 from lumidock.sim.lens import Lens
@@ -65,7 +66,7 @@ class Schedule:
         surface = scenario.around.surface
         if only_mirror:
             surface = (surface or WaterSurface()).model_copy(update={"height_m": float(course.surface_m[run])})
-        share = np.random.default_rng([*draws, 10]).uniform(*scenario.lamps.fouling, len(self.station))
+        share = np.random.default_rng([*draws, Draw.FOULING]).uniform(*scenario.lamps.fouling, len(self.station))
         return FrameConditions(
             t_s=t_s,
             exposure_s=exposure_s,
@@ -95,21 +96,20 @@ class Schedule:
         if drawn.black[number] or not scenario.detections.dock:
             return np.arange(len(station))
         run = int(self.course.run[number])
-        rng = np.random.default_rng([self.seed, 3, int(self.course.missing_from[number])])
+        rng = np.random.default_rng([self.seed, Draw.MISSING_LIGHTS, int(self.course.missing_from[number])])
         front = station.lights_of(station.layers_front_to_rear()[0])
         lit = in_view(station, self.camera, self.course.T_dock_cam[number])[1]
         off = drawn.dead[run] | failed(scenario, station, np.array([t_s]))[0]
         off[dark_lights(scenario, front[lit[front]], rng)] = True
-        return np.flatnonzero(
-            off | (np.random.default_rng([self.seed, 7, number]).random(len(off)) < scenario.detections.drop)
-        )
+        dropped = np.random.default_rng([self.seed, Draw.DROPPED_LIGHTS, number]).random(len(off))
+        return np.flatnonzero(off | (dropped < scenario.detections.drop))
 
     def _spurious(self, number: int) -> Array:
         """Pixels (S, 2) of the spurious lights: those that wander, and those of this frame alone."""
         scenario, camera = self.scenario, self.camera
         if self.drawn.black[number]:
             return np.empty((0, 2))
-        rng = np.random.default_rng([self.seed, 8, number])
+        rng = np.random.default_rng([self.seed, Draw.SPURIOUS_LIGHTS, number])
         new = int(rng.poisson(scenario.detections.clutter))
         if scenario.path.kind == "draws":
             new += int(rng.integers(*scenario.faults.spurious, endpoint=True))
@@ -123,12 +123,12 @@ class Schedule:
 
 def schedule_of(scenario: Scenario, station: Station, camera: Camera, seed: int) -> Schedule:
     """Draw the schedule of a scenario; automatic exposure is not yet applied."""
-    course = course_of(scenario, station, camera, np.random.default_rng([seed, 0]))
-    drawn = run_draws(scenario, station, course, np.random.default_rng([seed, 4]))
+    course = course_of(scenario, station, camera, np.random.default_rng([seed, Draw.COURSE]))
+    drawn = run_draws(scenario, station, course, np.random.default_rng([seed, Draw.RUN]))
     wander: Array = np.empty((len(course.t_ns), 0, 2))
     if scenario.path.kind != "draws":
         size = (camera.width, camera.height)
-        wander = spurious_paths(scenario, course.t_ns, size, np.random.default_rng([seed, 2]))
+        wander = spurious_paths(scenario, course.t_ns, size, np.random.default_rng([seed, Draw.WANDERING_LIGHTS]))
     exposure_s = np.full(len(course.t_ns), scenario.sensor.exposure_ms * 1e-3)
     return Schedule(
         scenario, station, camera, seed, course=course, drawn=drawn, spurious_uv=wander, exposure_s=exposure_s

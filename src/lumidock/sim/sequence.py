@@ -23,6 +23,7 @@ from lumidock.datatypes import Array, Indices
 from lumidock.errors import InputError, LumidockError
 from lumidock.geometry import quat_xyzw_from_rotation
 from lumidock.sim.detections import SimulatedFrame, simulated_frames
+from lumidock.sim.draws import Draw
 from lumidock.sim.frames import ExpectedFrame, FrameConditions, FrameRenderer
 from lumidock.sim.knobs import Output
 from lumidock.sim.lens import Lens, calibrated_in_water
@@ -143,7 +144,7 @@ def _unique(rows: list[Row]) -> list[Row]:
 def _scheduled(scenario: Scenario, station: Station, camera: Camera, seed: int) -> tuple[Schedule, list[Row]]:
     """The schedule and the rows of timestamps.csv. Raises: InputError when there are no rows."""
     schedule = schedule_of(scenario, station, camera, seed)
-    rows = rows_of(scenario.stream, schedule.course.t_ns, np.random.default_rng([seed, 6]))
+    rows = rows_of(scenario.stream, schedule.course.t_ns, np.random.default_rng([seed, Draw.STREAM_FAULTS]))
     if not rows:
         raise InputError(f"{scenario.name}: every frame is dropped")
     return schedule, rows
@@ -193,7 +194,7 @@ def _rendered_row(schedule: Schedule, row: Row) -> tuple[bytes, _Written]:
     renderer, conditions = schedule.renderer(row.shows), schedule.conditions(row.shows)
     if row.fault == "over_exposed":
         conditions = replace(conditions, exposure_s=conditions.exposure_s * OVER_EXPOSED)
-    rng = np.random.Generator(np.random.SFC64([schedule.seed, 9, row.shows]))
+    rng = np.random.Generator(np.random.SFC64([schedule.seed, Draw.SENSOR_NOISE, row.shows]))
     expected, image = _expose(renderer, conditions, rng)
     image = as_video(image, schedule.scenario.output)
     if row.fault in ("black", "white"):

@@ -19,7 +19,7 @@ _CAGE_M = (1.0, 1.0, 5.0)  # half width, half height and depth of the cage of th
 _BEHIND_M = 0.06  # from the lamps' plane back to the tubes of the cage
 _TUBE_M, _LAMP_M, _BRACKET_M = 0.03, 0.02, 0.012  # radii of tubes, lamp housings, brackets
 _THICK_M, _LARGE_M = 0.05, 30.0  # half thickness and half extent of walls
-_PROUD_M = 0.02  # by which the window stands out of the housing
+_WINDOW_OUT_M = 0.02  # by which the window stands out of the housing
 
 
 def tube(start: Array, end: Array, radius_m: float, finish: str, end_radius_m: float | None = None) -> Solid:
@@ -48,8 +48,8 @@ def lamp_bodies(station: Station) -> list[Solid]:
     """For each lamp a black housing with a metal front, behind the window, so that it does not block sideward light."""
     parts = []
     for p, axis in zip(station.p_dock, station.axis, strict=True):
-        parts.append(tube(p - _PROUD_M * axis, p - 0.07 * axis, _LAMP_M, "black"))
-        parts.append(ring(p - _PROUD_M * axis, 0.0, _LAMP_M, "metal", axis))
+        parts.append(tube(p - _WINDOW_OUT_M * axis, p - 0.07 * axis, _LAMP_M, "black"))
+        parts.append(ring(p - _WINDOW_OUT_M * axis, 0.0, _LAMP_M, "metal", axis))
     return parts
 
 
@@ -135,7 +135,7 @@ def basin(knobs: Basin) -> list[Solid]:
 
 
 def ropes(station: Station) -> list[Solid]:
-    """Two ropes that hold the dock from above, a thin line between them."""
+    """Two ropes that hold the dock from above, with a thin line between them."""
     half, top = 0.42 * np.ptp(station.p_dock[:, 0]), float(station.p_dock[:, 1].max())
     z = -_BEHIND_M
     sides = [
@@ -146,7 +146,7 @@ def ropes(station: Station) -> list[Solid]:
 
 
 def hull() -> list[Solid]:
-    """The nose of the own vehicle: yellow, glossy, in the lower part of the view."""
+    """The nose of the own vehicle: yellow and glossy, in the lower part of the picture."""
     return [
         Solid(kind="ellipsoid", frame="cam", center=(0.0, 0.30, 0.30), half_m=(0.30, 0.14, 0.30), finish="yellow"),
         Solid(
@@ -157,7 +157,7 @@ def hull() -> list[Solid]:
 
 
 def jellyfish(knobs: Jellyfish, T_dock_cam: Array, t_s: float, rng: np.random.Generator) -> list[Solid]:
-    """Bells that drift through the view; each stays at its distance from the camera."""
+    """Jellyfish that drift across the picture; each keeps its distance to the camera."""
     parts = []
     for _ in range(int(rng.integers(*knobs.count, endpoint=True))):
         r, far, speed = (rng.uniform(*reach) for reach in (knobs.radius_m, knobs.distance_m, knobs.speed_m_s))

@@ -19,7 +19,7 @@ from lumidock.station import Station
 _SNOW_TILE_M = 8.0  # the particles repeat with this period in x, y and z
 _NEAREST_M, _FAR_M = 0.15, 100.0  # of particles; of the water whose light is summed up
 _GLINT_M = 0.006  # radius of a glint
-_ABREAST = np.array([0.9, 0.15, 0.4])  # direction in `dock` along which the other vehicle's lamps stand
+_LAMP_ROW = np.array([0.9, 0.15, 0.4])  # direction in `dock` along which the other vehicle's lamps stand
 LAMP_EDGES_M = np.concatenate([[0.0], np.logspace(-1.0, 1.3, 28)])  # ranges between which headlamp light is integrated
 _FORWARD_RAD = np.deg2rad(30.0)  # daylight comes from a cone of about this half-angle
 
@@ -99,7 +99,7 @@ def vehicle(knobs: OtherVehicle, exposure: Exposure, radius_m: float) -> Emitter
     side = (np.arange(knobs.lamps) - 0.5 * (knobs.lamps - 1)) * knobs.spacing_m
     middle = np.array(knobs.start) + np.array(knobs.velocity_m_s) * exposure.t_s
     watt_sr = np.tile(knobs.power_w / (4.0 * np.pi) * np.array(SPECTRUM[knobs.color]), (knobs.lamps, 1))
-    return emitters("vehicle", exposure, exposure.p_cam(middle + side[:, None] * _ABREAST), watt_sr, radius_m)
+    return emitters("vehicle", exposure, exposure.p_cam(middle + side[:, None] * _LAMP_ROW), watt_sr, radius_m)
 
 
 def snow(knobs: Snow, scenario: Scenario, exposure: Exposure, rng: np.random.Generator) -> Emitters:
