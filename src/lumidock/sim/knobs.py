@@ -150,9 +150,9 @@ class Fish(KnobSection):
     """Fish: dark bodies that cross the picture and hide what is behind them."""
 
     count: Annotated[int, Field(ge=1, le=100)] = 3
-    length_m: Sizes = (0.2, 0.5)
+    length_m: Sizes = (0.2, 0.5)  # of each, drawn once a run
     distance_m: Sizes = (1.5, 4.0)  # from the camera
-    speed_m_s: Lengths = (0.2, 0.6)
+    speed_m_s: Lengths = (0.2, 0.6)  # across the picture
 
 
 class Surroundings(KnobSection):
