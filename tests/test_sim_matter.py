@@ -306,7 +306,7 @@ def test_a_screw_is_noted_as_a_reflection_and_an_edge_is_not():
 def test_a_finish_that_gives_more_light_than_comes_is_refused():
     with pytest.raises(InputError, match="albedo and gloss"):
         load_scenario("approach", ("matter.finishes={it: {albedo: [0.9, 0.9, 0.9], gloss: 0.2}}",))
-    with pytest.raises(InputError, match="no finish gold"):
+    with pytest.raises(InputError, match="gold: no such finish"):
         load_scenario("approach", ("matter.solids=[{kind: box, finish: gold}]",))
     assert all(max(*f.albedo, *f.second) + f.gloss <= 1.0 for f in FINISHES.values())
 
