@@ -12,12 +12,12 @@ import time
 from pathlib import Path
 
 from bench import (
+    association,
     contact_sheet,
     detection,
     detector_errors,
     dockings,
     images,
-    process_detections,
     rendering,
     reproduced,
     speed,
@@ -26,7 +26,7 @@ from bench import (
 )
 
 BENCHES = {
-    "process-detections": process_detections,
+    "association": association,
     "table1": table1,
     "images": images,
     "speed": speed,

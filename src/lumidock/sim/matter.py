@@ -10,6 +10,7 @@ from typing_extensions import Self
 from lumidock.sim.knobs import Counts, KnobSection, Lengths, Place, Probability, Sizes
 
 Reflectances = tuple[Probability, Probability, Probability]
+WallDistance = Annotated[float, Field(ge=0.0, le=900.0)]
 Extent = Annotated[float, Field(gt=0.0, le=1000.0)]
 Period = Annotated[float, Field(ge=1e-3, le=100.0)]
 
@@ -101,9 +102,9 @@ class Solid(KnobSection):
 class Basin(KnobSection):
     """Walls and floor of a pool or a channel around the dock; a distance of 0 leaves out the wall or the floor."""
 
-    back_m: NonNegativeFloat = 3.0  # from the dock's origin back to the wall behind it
-    side_m: NonNegativeFloat = 4.0  # from the dock's origin to the walls left and right
-    floor_m: NonNegativeFloat = 2.5  # from the dock's origin down to the floor
+    back_m: WallDistance = 3.0  # from the dock's origin back to the wall behind it
+    side_m: WallDistance = 4.0  # from the dock's origin to the walls left and right
+    floor_m: WallDistance = 2.5  # from the dock's origin down to the floor
     wall: str = "tiles"  # name of a finish
     floor: str = "tiles"  # name of a finish
 
