@@ -113,12 +113,12 @@ def test_snr_is_what_a_matched_filter_measures(rng):
     renderer = plan.renderer(0)
     conditions = replace(plan.conditions(0), T_dock_cam=head_on(26.0), T_cam_later=np.eye(4))
     expected = renderer.expect(conditions)
-    expected = expected.electrons.copy()
+    electrons_lit = expected.electrons.copy()
     without = renderer.expect(replace(conditions, dark=np.array([4]))).electrons
     u, v = np.round(expected.emitters.uv[4]).astype(int)
     box = np.s_[v - 6 : v + 7, u - 6 : u + 7]
-    ring = (expected - without)[v - 6, u - 6 : u + 7].mean()
-    signal = (expected - without)[box] - ring
+    ring = (electrons_lit - without)[v - 6, u - 6 : u + 7].mean()
+    signal = (electrons_lit - without)[box] - ring
     weight = signal / (without[box] + ring + 2.3**2)
     outputs = []
     for _ in range(400):
