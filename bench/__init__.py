@@ -1,1 +1,1 @@
-"""What the figures of README and docs/ come from: `make bench`, or `python -m bench NAME` for one of them."""
+"""Measures the figures of the documentation: `make bench` runs all benches, `python -m bench NAME` one of them."""

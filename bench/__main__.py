@@ -13,6 +13,7 @@ from pathlib import Path
 
 from bench import (
     acquisition,
+    association,
     configuration,
     contact_sheet,
     detection,
@@ -20,7 +21,6 @@ from bench import (
     detector_errors,
     dockings,
     docks,
-    doors,
     images,
     lamp_weights,
     nominal,
@@ -34,7 +34,7 @@ from bench import (
 BENCHES = {
     "acquisition": acquisition,
     "nominal": nominal,
-    "doors": doors,
+    "association": association,
     "table1": table1,
     "images": images,
     "speed": speed,

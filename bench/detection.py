@@ -1,4 +1,4 @@
-"""Detections before any naming, over rendered sequences: recall, false lamps, centres and their covariances."""
+"""The detector before any association, on rendered sequences: recall, false lamps, centroids and covariances."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from bench.shipped import shipped_camera, shipped_station
+from bench.shipped import shipped_camera
 from lumidock import detect, layers
 from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Frame
 from lumidock.localizer import Localizer
 from lumidock.sim.scenario import shipped_scenarios
+from lumidock.station import load_station
 from lumidock.streams.sources import open_source
 
 _SCENARIOS = ("approach", "water-1c", "shallow", "headlamp", "fouling", "pool", "snow")
 _SEED, _INTERVAL_S = 7511, 0.75
 _NEAR_PX, _SAME_PX = 2.5, 6.0
 _SNRS = (8.0, 12.0, 50.0)
-_FEW = 10  # lights of a kind that say too little
+_FEW = 10  # fewer lights of a kind than this are left out
 _RUNS = 6
 _NEAR_SIX = ("path.start_z_m=6.6", "path.end_z_m=5.4", "path.frame_interval_s=0.15")
 Rows = dict[str, list[dict[str, str]]]
 
 
 def by_frame(path: Path) -> Rows:
-    """Rows of a table by frame."""
+    """Rows of a CSV file, grouped by frame."""
     rows: Rows = defaultdict(list)
     with path.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
@@ -39,7 +40,7 @@ def by_frame(path: Path) -> Rows:
 
 
 def matches(found: Detections, uv: Array, near_px: float = _NEAR_PX) -> np.ndarray:
-    """Index (N,) of the lamp, of those at pixels `uv` (M, 2), that made each detection; -1: none. Nearest first."""
+    """Index (N,) of the lamp at pixels `uv` (M, 2) that made each detection, -1 for none; nearest pairs first."""
     owner = np.full(len(found), -1)
     if not len(uv) or not len(found):
         return owner
@@ -53,7 +54,7 @@ def matches(found: Detections, uv: Array, near_px: float = _NEAR_PX) -> np.ndarr
 
 
 def measure(folder: Path) -> dict[str, float]:
-    """Figures of one sequence folder with truth."""
+    """Figures of the detector on one sequence folder with truth."""
     truth, apart = by_frame(folder / "lights_truth.csv"), by_frame(folder / "spurious_truth.csv")
     config = Config()
     seen = dict.fromkeys(_SNRS, 0)
@@ -107,8 +108,8 @@ def measure(folder: Path) -> dict[str, float]:
 
 
 def range_errors_mm(folder: Path) -> list[float]:
-    """Errors of the range in each frame that gives a pose without history."""
-    localizer = Localizer(shipped_station(), shipped_camera(), cold=True)
+    """Errors of the range, mm, in each frame that gives a pose without history."""
+    localizer = Localizer(load_station(folder / "station.yaml"), shipped_camera(), cold=True)
     truth, errors = by_frame(folder / "truth.csv"), []
     for frame in open_source(folder).items():
         fix = localizer.process(frame) if isinstance(frame, Frame) else None
@@ -129,7 +130,7 @@ def _size_kind(frame: Frame, found: Detections, i: int, snr: float) -> str:
 
 
 def simulate(scenario: str, seed: int, out: Path, *settings: str) -> None:
-    """Render a thinned-out run of a scenario."""
+    """Render a run of a scenario with a coarser path, on the station of the scenario."""
     command = [sys.executable, "-m", "lumidock", "sim", scenario, "--seed", str(seed), "--out", str(out)]
     for setting in (f"path.frame_interval_s={_INTERVAL_S}", *settings):
         command += ["--set", setting]
@@ -137,7 +138,7 @@ def simulate(scenario: str, seed: int, out: Path, *settings: str) -> None:
 
 
 def main() -> tuple[dict[str, object], list[str]]:
-    """One row a scenario."""
+    """One row per scenario."""
     content: dict[str, object] = {}
     for scenario in (name for name in _SCENARIOS if name in shipped_scenarios()):
         with TemporaryDirectory() as name:
@@ -150,11 +151,11 @@ def main() -> tuple[dict[str, object], list[str]]:
         assert isinstance(figures, dict)
         lines.append(f"| {scenario} | " + " | ".join(f"{figures[c]:.2f}" for c in columns) + " |")
     kinds = [f"{color} {kind}" for color in ("white", "blue") for kind in ("saturated", ">50", "20-50", "<20")]
-    lines += ["", "| centres, px rms (NEES / 2, its median / 1.39) | " + " | ".join(kinds) + " |"]
+    lines += ["", "| centroids, px rms (NEES / 2, its median / 1.39) | " + " | ".join(kinds) + " |"]
     lines.append("|---" * (len(kinds) + 1) + "|")
     for scenario, figures in content.items():
         assert isinstance(figures, dict)
-        lines.append(f"| {scenario} | " + " | ".join(_centres(figures, kind) for kind in kinds) + " |")
+        lines.append(f"| {scenario} | " + " | ".join(_centroids(figures, kind) for kind in kinds) + " |")
     errors: list[float] = []
     for seed in range(_SEED, _SEED + _RUNS):
         with TemporaryDirectory() as name:
@@ -167,7 +168,7 @@ def main() -> tuple[dict[str, object], list[str]]:
     return content, lines
 
 
-def _centres(figures: dict[str, float], kind: str) -> str:
+def _centroids(figures: dict[str, float], kind: str) -> str:
     if figures.get(f"{kind}: n", 0) < _FEW:
         return ""
     rms, nees, median = (figures[f"{kind}: {name}"] for name in ("rms", "nees/2", "med nees"))

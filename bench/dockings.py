@@ -1,7 +1,7 @@
-"""Every shipped docking, rendered whole, through the default method: where guide and pose begin, and gaps.
+"""Every shipped docking, rendered in full, through the default method: where guide and pose begin, and gaps.
 
-All frames of the camera's 6.7 a second, two seeds a docking: an hour of one core. What is done stays in
-bench-out/dockings, and the same command goes on from there.
+All frames at 6.7 a second, two seeds per docking, on the station of the scenario: an hour of one core. Finished
+dockings stay in bench-out/dockings, from where the same command continues.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from bench.shipped import CAMERA_FILE, STATION_FILE
+from bench.shipped import CAMERA_FILE
 from lumidock.config import Config
 from lumidock.evaluation.metrics import read_rows, true_poses
 from lumidock.reproduce import Dock, work
 from lumidock.reproduce.jobs import Job, run_jobs
-from lumidock.sim.scenario import load_scenario, shipped_scenarios
+from lumidock.sim.scenario import load_scenario, shipped_scenarios, station_of
 
 SEEDS = (7300, 7301)
 _NEAR_M = (5.0, 7.0)
@@ -36,9 +36,9 @@ _COLUMNS = (
 
 
 def docking(scenario: str, seed: int, folder: str) -> dict[str, Any]:
-    """Figures of one docking: z of the first guide and of three valid poses in a row, gaps after, errors, hazards."""
-    place = Path(folder)
-    simulation = work.Simulation(Dock(str(STATION_FILE), str(CAMERA_FILE)), scenario, (), seed)
+    """Figures of one docking: z of the first guide and of three consecutive valid poses, gaps, errors, hazards."""
+    place, station_file = Path(folder), station_of(load_scenario(scenario))
+    simulation = work.Simulation(Dock(str(station_file), str(CAMERA_FILE)), scenario, (), seed)
     judged = work.docking(simulation, folder, False, ("lumidock",), Config())["lumidock"]
     figures = _figures(place / "lumidock", place / "sequence")
     shutil.rmtree(place)
@@ -80,7 +80,7 @@ def _figures(run_folder: Path, sequence: Path) -> dict[str, float]:
 
 
 def main() -> tuple[dict[str, object], list[str]]:
-    """One row a docking, its seeds in each cell, and the sum of all."""
+    """One row per docking with all seeds in each cell, and the sum over all."""
     names = [name for name in shipped_scenarios() if load_scenario(name).path.kind != "draws"]
     out = Path("bench-out/dockings")
     jobs = [

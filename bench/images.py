@@ -1,4 +1,4 @@
-"""The paper's approach and its rectangular search as rendered frames through the whole method."""
+"""The paper's whole method on rendered frames of its approach and of its rectangular search."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from lumidock.config import Config, ExtractConfig
 from lumidock.datatypes import Frame
 from lumidock.evaluation.metrics import evaluate, read_rows
 from lumidock.paper import PaperLocalizer, extract
+from lumidock.sim.draws import Draw
 from lumidock.sim.scenario import load_scenario, trajectory
 from lumidock.sim.sequence import render_frame, write_rendered
 from lumidock.streams.run_folder import RunFolder
@@ -53,7 +54,7 @@ def search_identities(sequence: Path, out: Path) -> tuple[int, int]:
 
 
 def _maker(detection: dict[str, str], lights: dict[str, np.ndarray]) -> str:
-    """The light that made a detection, or nothing."""
+    """Id of the light that made a detection, or an empty text."""
     at = np.array([float(detection["u_px"]), float(detection["v_px"])])
     light = min(lights, key=lambda name: float(np.hypot(*(lights[name] - at))), default="")
     return light if light and np.hypot(*(lights[light] - at)) < _SAME_DETECTION_PX else ""
@@ -62,12 +63,12 @@ def _maker(detection: dict[str, str], lights: dict[str, np.ndarray]) -> str:
 def rear_reach_m(gray: Literal["max", "luma"], seed: int) -> float:
     """Farthest z of the approach from which on, down to 4 m, all six rear lights are found in every third frame."""
     scenario, station, camera = load_scenario("approach"), shipped_station(), shipped_camera()
-    _, poses = trajectory(scenario, np.random.default_rng([seed, 0]))
+    _, poses = trajectory(scenario, np.random.default_rng([seed, Draw.COURSE]))
     rear, reach = station.lights_of("rear"), 4.0
     for number in [n for n in range(0, len(poses), 3) if 4.0 <= poses[n, 2, 3] < 17.0][::-1]:
         rng = np.random.default_rng([seed, number])
         nothing = np.empty(0, np.int64)
-        image, seen, _ = render_frame(scenario, station, camera, poses[number], np.empty((0, 2)), nothing, rng)
+        image, seen, _ = render_frame(scenario, station, camera, poses[number], np.empty((0, 2)), dark=nothing, rng=rng)
         detections = extract.lights(Frame("", 0, image), ExtractConfig(gray=gray)).uv
         distance = np.linalg.norm(detections[:, None] - seen.uv[rear][None], axis=2).min(axis=0, initial=np.inf)
         if (distance >= _SAME_DETECTION_PX).any():
@@ -77,7 +78,7 @@ def rear_reach_m(gray: Literal["max", "luma"], seed: int) -> float:
 
 
 def main() -> tuple[dict[str, object], list[str]]:
-    """One row a seed, and the search."""
+    """One row per seed, and the search."""
     lines = [
         "| approach, seed | front fixes, z m | rear fixes, z m | longest gap, s | layer offset, m | wrong identities |",
         "|---|---|---|---|---|---|",

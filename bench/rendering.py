@@ -1,4 +1,4 @@
-"""Cost of a rendered frame on one core: expected light, read-out and development, encoding; peak memory."""
+"""Cost of a rendered frame on one core: expected electrons, read-out and picture, encoding; peak memory."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from tempfile import TemporaryDirectory
 import cv2
 import numpy as np
 
-from bench.shipped import shipped_camera, shipped_station
+from bench.shipped import shipped_camera
 from lumidock.sim.scattering import halo
-from lumidock.sim.scenario import load_scenario
+from lumidock.sim.scenario import load_scenario, station_of
 from lumidock.sim.schedule import schedule_of
+from lumidock.station import load_station
 
 SCENARIOS = ("approach", "headlamp", "pool", "occluder", "flat-port")
 FRAMES = (40, 140, 190, 215)  # of the approach: z = 24, 9, 1.5, -2.25 m
@@ -22,7 +23,7 @@ _REPEATS = 5
 
 
 def _best_s(step: Callable[[], object]) -> float:
-    """CPU time of the fastest of some repeats."""
+    """CPU time s of the fastest of `_REPEATS` runs."""
     times = []
     for _ in range(_REPEATS):
         start = time.process_time()
@@ -32,22 +33,29 @@ def _best_s(step: Callable[[], object]) -> float:
 
 
 def costs_ms(name: str, folder: Path) -> list[float]:
-    """Slowest of the frames: all, light, sensor, encoding; ms."""
-    plan = schedule_of(load_scenario(name), shipped_station(), shipped_camera(), 0)
+    """Milliseconds of the slowest of `FRAMES`: all, expected electrons, sensor, encoding."""
+    scenario = load_scenario(name)
+    schedule = schedule_of(scenario, load_station(station_of(scenario)), shipped_camera(), 0)
     rows = []
     for number in FRAMES:
-        studio, moment = plan.studio(number), plan.moment(number)
-        shot = studio.shoot(moment)
-        image = studio.develop(shot, np.random.Generator(np.random.SFC64(0)))
-        light = _best_s(lambda studio=studio, moment=moment: (halo.cache_clear(), studio.shoot(moment)))
-        sensor = _best_s(lambda studio=studio, shot=shot: studio.develop(shot, np.random.Generator(np.random.SFC64(0))))
+        renderer, conditions = schedule.renderer(number), schedule.conditions(number)
+        expected = renderer.expect(conditions)
+        image = renderer.picture_of(expected, np.random.Generator(np.random.SFC64(0)))
+        light = _best_s(
+            lambda renderer=renderer, conditions=conditions: (halo.cache_clear(), renderer.expect(conditions))
+        )
+        sensor = _best_s(
+            lambda renderer=renderer, expected=expected: renderer.picture_of(
+                expected, np.random.Generator(np.random.SFC64(0))
+            )
+        )
         file = _best_s(lambda image=image: cv2.imwrite(str(folder / "a.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 95]))
         rows.append(1e3 * np.array([light + sensor + file, light, sensor, file]))
     return [float(value) for value in max(rows, key=lambda row: row[0])]
 
 
 def main() -> tuple[dict[str, object], list[str]]:
-    """One row a scenario."""
+    """One row per scenario."""
     cv2.setNumThreads(1)
     mono = np.zeros((2048, 2448), np.uint8)
     unit = 1e3 * _best_s(lambda: [mono.max() for _ in range(20)]) / 20

@@ -1,7 +1,7 @@
 """Milliseconds from pixels to detections and to a fix, beside one pass over the frame and what others use; one core.
 
-Everything is timed in one process, in turns, in CPU time of the thread; before each timing the caches are filled with
-something else. "passes" are multiples of `np.max` over the same frame as mono.
+Everything is timed in one process, in turns, in CPU time of the thread; before each timing the CPU caches are filled
+with other data. "passes" are multiples of the time of `np.max` over the same frame as mono.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from lumidock.station import Station
 from lumidock.streams.sources import open_source
 
 _Z_M, _ROUNDS, _SEED, _STARTS = (18.0, 9.0, 2.3), 7, 7100, 3
-_LIGHTS, _STRAYS = (7, 13, 25, 50), (0, 2, 10, 50)
+_LIGHTS, _SPURIOUS = (7, 13, 25, 50), (0, 2, 10, 50)
 _OUTPUT = {
     "mono8": ("output.pixels=mono8", "output.color=false", "output.file=png"),
     "bayer_rggb8": ("output.pixels=bayer8", "output.file=png"),
     "bgr8": (),
 }
-_OTHERS = np.ones(1 << 26, np.uint8)  # zeros that nobody wrote are one page
+_OTHERS = np.ones(1 << 26, np.uint8)  # memory of zeros that were never written would share one page
 Times = dict[str, list[float]]
 
 
@@ -50,14 +50,14 @@ def simulate(z_m: float, kind: str, out: Path) -> None:
 
 
 def sequence(z_m: float, kind: str) -> list[Frame]:
-    """These frames, decoded."""
+    """The decoded frames that `simulate` renders."""
     with TemporaryDirectory() as name:
         simulate(z_m, kind, Path(name) / "s")
         return [frame for frame in open_source(Path(name) / "s").items() if isinstance(frame, Frame)]
 
 
 def timed(times: Times, name: str, job: Callable[[], object]) -> None:
-    """Add the milliseconds of a job that finds cold caches."""
+    """Add the milliseconds of a job that starts with none of its data in the CPU caches."""
     _OTHERS.max()
     start = time.thread_time()
     job()
@@ -65,7 +65,7 @@ def timed(times: Times, name: str, job: Callable[[], object]) -> None:
 
 
 def lumidock_round(times: Times, frames: list[Frame]) -> None:
-    """One run over the frames: first frame searched in full, later ones where the track holds."""
+    """One run over the frames: full search in frames without a track, else search near predicted measurements."""
     localizer, config = Localizer(shipped_station(), shipped_camera()), Config()
     full = detect.Scan(frames[0], config.detect)
     timed(times, "np.max over it", lambda: frames[0].image.max())
@@ -85,7 +85,7 @@ def lumidock_round(times: Times, frames: list[Frame]) -> None:
 
 
 def blobs_and_pnp(frame: Frame) -> None:
-    """What many write first: OpenCV's blobs and a pose from the lights as if all were named."""
+    """A common baseline: OpenCV's blob detector, and a pose from all lights with known association."""
     parameters = cv2.SimpleBlobDetector_Params()
     parameters.filterByColor, parameters.blobColor = True, 255
     parameters.filterByArea, parameters.minArea = True, 4.0
@@ -119,9 +119,9 @@ def growth(spurious: tuple[int, ...]) -> dict[str, float]:
 
 
 def matching_growth(lights: tuple[int, ...], spurious: tuple[int, ...]) -> dict[int, dict[int, tuple[float, float]]]:
-    """Median and largest ms of naming one frame without history, by lights, then spurious spots; some are dark.
+    """Median and largest ms of acquisition in one frame, by lights, then by spurious detections; a tenth is dark.
 
-    The lights stand anywhere on two planes 5 m apart, as many on either, and are seen from 9 m without colour.
+    The lights have random positions on two planes 5 m apart, and are seen from 9 m without colour.
     """
     rng, camera, config = np.random.default_rng(_SEED), shipped_camera(), Config()
     grown: dict[int, dict[int, tuple[float, float]]] = {m: {} for m in lights}
@@ -145,7 +145,7 @@ def matching_growth(lights: tuple[int, ...], spurious: tuple[int, ...]) -> dict[
 
 
 def dense_station(lights: int, rng: np.random.Generator) -> Station:
-    """A dock of so many lights at random, 0.15 m apart at least, on two planes of 2 x 2 m."""
+    """A dock of this many lights at random positions at least 0.15 m apart, on two planes of 2 x 2 m."""
     p: list[np.ndarray] = []
     while len(p) < lights:
         place = np.array([*rng.uniform(-1.0, 1.0, 2), -5.0 * (len(p) % 2)])
@@ -188,7 +188,7 @@ print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024.0)
 
 
 def start_up(frame: Frame) -> tuple[float, float]:
-    """Seconds to the third frame with empty and with warm caches of compiled code."""
+    """Seconds to the third frame, with and without compiling."""
     with TemporaryDirectory() as name:
         np.save(f"{name}/frame.npy", frame.image)
         code = _START.format(path=f"{name}/frame.npy")
@@ -203,7 +203,7 @@ def start_up(frame: Frame) -> tuple[float, float]:
 
 
 def peak_memory() -> float:
-    """MiB of a process that runs over a folder of BGR frames and has nothing to compile."""
+    """Peak memory MiB of a run over a folder of BGR frames that has nothing to compile."""
     with TemporaryDirectory() as name:
         simulate(9.0, "bgr8", Path(name) / "s")
         peaks = []
@@ -215,7 +215,7 @@ def peak_memory() -> float:
 
 
 def main() -> tuple[dict[str, object], list[str]]:
-    """Medians over rounds in turns: a row a job, a column a distance."""
+    """Medians over rounds: one row per job, one column per distance."""
     cv2.setNumThreads(1)
     frames = {(z, kind): sequence(z, kind) for z in _Z_M for kind in _OUTPUT}
     times: dict[tuple[float, str], Times] = defaultdict(lambda: defaultdict(list))
@@ -242,16 +242,16 @@ def main() -> tuple[dict[str, object], list[str]]:
             content[f"{kind}: {job}"] = medians
             lines.append(f"| {kind}: {job} | " + " | ".join(f"{m:.2f} ({m / one_pass:.1f})" for m in medians) + " |")
     content["growth_ms"] = grown = growth((2, 20, 200))
-    content["matching_ms"] = named = matching_growth(_LIGHTS, _STRAYS)
+    content["matching_ms"] = matching = matching_growth(_LIGHTS, _SPURIOUS)
     (cold_s, warm_s), peak = start_up(frames[9.0, "bgr8"][0]), peak_memory()
     content |= {"start_cold_s": cold_s, "start_warm_s": warm_s, "peak_mib": peak, "machine": machine()}
     lines += ["", "Full search of a mono frame, ms: " + ", ".join(f"{k} {v:.2f}" for k, v in grown.items()) + "."]
     lines += [
         "",
-        "| naming a frame without history, ms: median / largest | " + " | ".join(map(str, _STRAYS)) + " spurious |",
+        "| acquisition in one frame, ms: median / largest | " + " | ".join(map(str, _SPURIOUS)) + " spurious |",
     ]
-    lines += ["|---" * (len(_STRAYS) + 1) + "|"]
-    for m, row in named.items():
+    lines += ["|---" * (len(_SPURIOUS) + 1) + "|"]
+    for m, row in matching.items():
         lines.append(f"| {m} lights | " + " | ".join(f"{a:.2f} / {b:.2f}" for a, b in row.values()) + " |")
     lines.append("")
     lines.append(
@@ -263,7 +263,7 @@ def main() -> tuple[dict[str, object], list[str]]:
 
 
 def machine() -> str:
-    """What the figures were measured on."""
+    """Description of the machine of the measurement."""
     model = next(
         (line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line),
         platform.machine(),

@@ -1,4 +1,4 @@
-"""How far each layer is seen: the range of matched-filter SNR 8 by water and exposure."""
+"""Range at which the matched-filter SNR of each layer is 8, by water and exposure."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ _SNR, _REACH_M = 8.0, (0.5, 120.0)
 
 
 def snr(settings: tuple[str, ...], station: Station, layer: str, range_m: float) -> float:
-    """Median matched-filter SNR of a layer's lights, seen head-on with the layer's middle at `range_m`."""
+    """Median matched-filter SNR of a layer's lights; the camera is head-on, `range_m` from the layer's middle."""
     lights = station.lights_of(layer)
-    plan = schedule_of(load_scenario("approach", settings), station, shipped_camera(), 0)
+    schedule = schedule_of(load_scenario("approach", settings), station, shipped_camera(), 0)
     T_dock_cam = np.eye(4)
     T_dock_cam[:3, :3], T_dock_cam[2, 3] = R_DOCK_CAM_HEAD_ON, range_m + float(station.p_dock[lights, 2].mean())
-    moment = replace(plan.moment(0), T_dock_cam=T_dock_cam, T_cam_later=np.eye(4))
-    shown = plan.studio(0).shoot(moment)
-    inside = lights[shown.seen.lit[lights]]
-    return float(np.median(shown.snr[inside])) if len(inside) else np.inf
+    conditions = replace(schedule.conditions(0), T_dock_cam=T_dock_cam, T_cam_later=np.eye(4))
+    expected = schedule.renderer(0).expect(conditions)
+    inside = lights[expected.emitters.lit[lights]]
+    return float(np.median(expected.snr[inside])) if len(inside) else np.inf
 
 
 def reach_m(settings: tuple[str, ...], station: Station, layer: str) -> float:
@@ -38,7 +38,7 @@ def reach_m(settings: tuple[str, ...], station: Station, layer: str) -> float:
 
 
 def main() -> tuple[dict[str, object], list[str]]:
-    """One row a water."""
+    """One row per water."""
     heads = [f"{layer}, {ms:g} ms" for layer in ("front", "rear") for ms in EXPOSURES_MS]
     lines = [f"| water | {' | '.join(heads)} |", "|---" * (len(heads) + 1) + "|"]
     content: dict[str, object] = {}

@@ -8,12 +8,13 @@ from bench.shipped import shipped_camera, shipped_station
 from lumidock.datatypes import Detections
 from lumidock.errors import InputError
 from lumidock.sim.detections import simulated_frames
-from lumidock.sim.measured import KINDS, detector_errors, measured_like, measured_table
+from lumidock.sim.measured import KINDS, detector_errors, is_measured, measured_like, measured_table
 from lumidock.sim.scenario import load_scenario, shipped_scenarios
 
 STATION, CAMERA = shipped_station(), shipped_camera()
 REAR = STATION.layer != STATION.layers.index(STATION.layers_front_to_rear()[0])
 PATHS = [name for name in shipped_scenarios() if load_scenario(name).path.kind != "draws"]
+MEASURED = [name for name in PATHS if is_measured(load_scenario(name))]
 
 
 def frames_of(name, like, *settings, seed=5):
@@ -21,8 +22,24 @@ def frames_of(name, like, *settings, seed=5):
     return list(simulated_frames(scenario, STATION, CAMERA, seed))
 
 
-@pytest.mark.parametrize("name", PATHS)
-def test_the_detector_was_measured_on_the_pictures_of_every_shipped_docking(name):
+def test_a_scenario_is_measured_if_the_table_has_pictures_like_its_own():
+    """Every scenario of the table, and those that share its pictures: different paths and faults of the stream."""
+    assert set(measured_table()["scenarios"]) <= set(MEASURED)
+    assert {"trials", "rectangle", "stream-faults"} <= set(MEASURED)
+
+
+@pytest.mark.parametrize("name", sorted(set(PATHS) - set(MEASURED)))
+def test_a_shipped_docking_without_measurements_is_refused_in_one_line(name):
+    with pytest.raises(InputError, match=f"^{name}: no detector errors were measured on such pictures$"):
+        measured_like(load_scenario(name))
+
+
+def test_the_same_pictures_on_another_station_are_not_measured():
+    assert not is_measured(load_scenario("approach", ("station=plate",)))
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_measured_errors_of_a_shipped_docking_are_complete(name):
     errors = detector_errors(measured_like(load_scenario(name)))
     for kind in KINDS:
         for cell in errors.cells[kind]:
@@ -34,12 +51,12 @@ def test_the_detector_was_measured_on_the_pictures_of_every_shipped_docking(name
 def test_pictures_that_were_not_measured_are_refused_in_one_line():
     with pytest.raises(InputError, match="no detector errors"):
         measured_like(load_scenario("approach", ("water.b_factor=1.7",)))
-    with pytest.raises(InputError, match=r"spots\.detector: mud is not measured; there are approach"):
+    with pytest.raises(InputError, match=r"detections\.detector: mud is not measured; there are approach"):
         frames_of("approach", "mud")
 
 
 @pytest.mark.parametrize("like", ["approach", "water-5c", "occluder"])
-def test_lights_are_found_and_false_spots_seen_as_often_as_measured(like):
+def test_lights_are_detected_and_false_detections_occur_as_often_as_measured(like):
     """Counted from the frames alone, against the counts in the file."""
     content, edges = measured_table()["scenarios"][like], measured_table()["edges_m"]
     seen = {kind: np.zeros((len(edges), 2)) for kind in KINDS}
@@ -58,7 +75,7 @@ def test_lights_are_found_and_false_spots_seen_as_often_as_measured(like):
             assert abs(found - of * rate) <= 5.0 * sigma + 1e-9, (kind, of, found, rate)
 
 
-def test_spots_err_as_measured_over_their_own_covariance():
+def test_detections_err_as_measured_over_their_own_covariance():
     rows = measured_table()["scenarios"]["pool"]
     wanted = {
         (detection[0], detection[1])
@@ -89,23 +106,23 @@ def test_faults_of_the_scenario_stay_beside_the_detectors():
     assert not any(STATION.ids.index("F1") in frame.light for frame in dead)
 
 
-def test_a_frame_is_counted_by_what_became_of_each_light():
+def test_each_light_and_detection_of_a_frame_is_counted():
     cells = {kind: [bench.Cell() for _ in bench.EDGES_M] for kind in KINDS}
     lit = np.array(  # u, v, range, whether rear, SNR
         [
             [100.0, 100.0, 7.0, 0, 9.0],
-            [640.0, 481.0, 7.0, 0, 3.0],  # does not stand out: the spot beside it is another's
+            [640.0, 481.0, 7.0, 0, 3.0],  # below the noise: the detection beside it is another's
             [200.0, 200.0, 12.0, 1, 50.0],
             [402.0, 400.0, 12.0, 1, 50.0],  # not found, but a hot pixel is
         ]
     )
     uv = np.array([[103.0, 104.0], [200.0, 200.5], [500.0, 500.0], [640.0, 480.0], [400.0, 400.0]])
-    stray, hot = np.array([[500.0, 501.0]]), np.array([[200.0, 200.6], [400.0, 400.0]])
+    injected, hot = np.array([[500.0, 501.0]]), np.array([[200.0, 200.6], [400.0, 400.0]])
     p_light, p_rear = np.array([0.9, 0.8, 1.0, 0.1, 0.2]), np.array([0.1, 0.2, 0.1, np.nan, 0.3])
     cov = np.tile(np.diag([0.25, 0.25]), (5, 1, 1))
     cov[1] = np.diag([0.01, 1.0])  # its error is along v
-    found = Detections("0", 0, uv, np.ones(5), np.ones(5), p_light, p_rear, cov)
-    bench.add(cells, found, lit, stray, hot, 7.0)
+    found = Detections("0", 0, uv, np.ones(5), np.ones(5), p_light=p_light, p_rear=p_rear, cov_px2=cov)
+    bench.add(cells, found, lit, injected, hot, 7.0)
     front, rear, false = cells["front"][1], cells["rear"][2], cells["false"][1]
     assert (front.of, rear.of, false.of) == (2, 2, 1)
     np.testing.assert_allclose(front.detections, [[0.5, 10.0, 0.9, 0.1]])
@@ -114,7 +131,7 @@ def test_a_frame_is_counted_by_what_became_of_each_light():
     assert false.as_dict(20)["detections"] == [[0.5, 0.0, 0.1, None], [0.5, 0.0, 0.2, 0.3]]
 
 
-def test_what_is_kept_of_many_spots_keeps_the_worst():
+def test_a_sample_of_many_detections_has_the_worst():
     cell = bench.Cell(of=500, detections=[[0.3, float(k), 1.0, 0.1] for k in np.random.default_rng(1).permutation(400)])
     kept = cell.as_dict(20)
     assert (kept["of"], kept["seen"]) == (500, 400)

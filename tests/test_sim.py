@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bench.shipped import shipped_camera, shipped_station
+from bench.shipped import CAMERA_FILE, STATION_FILE, shipped_camera, shipped_station
 
 from lumidock.errors import InputError
+from lumidock.evaluation.campaign import plan
 from lumidock.geometry import so3_exp, so3_log
 from lumidock.pose import project_lights
 from lumidock.sim.detections import simulated_frames
@@ -17,9 +18,11 @@ from lumidock.sim.scenario import (
     load_scenario,
     rotations,
     shipped_scenarios,
+    station_of,
     trajectory,
 )
 from lumidock.sim.sequence import write_detections
+from lumidock.station import load_station
 
 STATION, CAMERA = shipped_station(), shipped_camera()
 
@@ -92,7 +95,7 @@ def test_bad_settings_are_refused_in_one_line(setting):
     assert "\n" not in str(caught.value)
 
 
-def test_spots_have_the_truth_they_claim():
+def test_detections_lie_where_their_lights_truly_are():
     scenario = load_scenario("trials", ("faults.missing=2", "faults.spurious=3", "detections.noise_px=0.0"))
     for frame in simulated_frames(scenario, STATION, CAMERA, 4):
         named = frame.light >= 0
@@ -125,7 +128,7 @@ def test_rotations_are_those_of_one_at_a_time(rng):
 
 
 @pytest.mark.parametrize("name", ["nominal", "joint", "three-lights", "rectangle"])
-def test_truth_of_spots_is_the_projection_from_the_true_pose(name):
+def test_truth_of_detections_is_the_projection_from_the_true_pose(name):
     settings = ("detections.survey=false", "detections.calibration=false", "detections.noise_px=0")
     for frame in frames_of(name, *settings)[::7]:
         uv = project_lights(CAMERA, frame.T_dock_cam, STATION.p_dock)
@@ -159,9 +162,9 @@ def test_draws_are_spread_and_have_the_front_layer_in_view():
     assert 3.0 < tilt.max() <= np.hypot(3, 3) + 1e-6
     np.testing.assert_allclose(np.percentile(roll, [0, 50, 100]), [-3, 0, 3], atol=0.15)
     assert all(frame.in_view[:7].all() and not frame.in_view[7:].any() for frame in frames)
-    stray = np.concatenate([frame.detections.uv[frame.light < 0] for frame in frames])
-    assert CAMERA.contains(stray).all()
-    np.testing.assert_allclose(stray.mean(axis=0) / [CAMERA.width, CAMERA.height], 0.5, atol=0.02)
+    spurious = np.concatenate([frame.detections.uv[frame.light < 0] for frame in frames])
+    assert CAMERA.contains(spurious).all()
+    np.testing.assert_allclose(spurious.mean(axis=0) / [CAMERA.width, CAMERA.height], 0.5, atol=0.02)
     shares = np.bincount([len(named(frame)) for frame in frames], minlength=8)[4:7] / len(frames)
     np.testing.assert_allclose(shares, 1 / 3, atol=0.04)
     shares = np.bincount([(frame.light < 0).sum() for frame in frames], minlength=6)[1:] / len(frames)
@@ -202,9 +205,9 @@ def test_beside_is_beside():
     for frame in frames_of("beside", "path.count=100", "detections.noise_px=0"):
         corners = frame.uv[:7].min(axis=0), frame.uv[:7].max(axis=0)
         margin = 0.25 * (corners[1] - corners[0])
-        stray = frame.detections.uv[frame.light < 0]
-        assert len(stray) == 5
-        assert ((stray >= corners[0] - margin) & (stray <= corners[1] + margin)).all()
+        spurious = frame.detections.uv[frame.light < 0]
+        assert len(spurious) == 5
+        assert ((spurious >= corners[0] - margin) & (spurious <= corners[1] + margin)).all()
 
 
 def test_labels_are_wrong_and_lights_missing_as_often_as_asked():
@@ -364,3 +367,26 @@ def test_detections_folder_says_what_was_seen(tmp_path):
     assert frames == len(read(tmp_path / "timestamps.csv"))
     assert sum(row["visible"] == "1" for row in truth) == len(detections)
     assert (tmp_path / "camera.yaml").exists()
+
+
+# Stations
+
+
+def test_a_scenario_is_simulated_on_the_station_that_it_is_made_for():
+    assert load_station(station_of(load_scenario("approach"))).name == STATION.name
+    assert {name: load_station(station_of(load_scenario(name))).name for name in ("plate", "funnel")} == {
+        "plate": "plate",
+        "funnel": "funnel-ring",
+    }
+    with pytest.raises(InputError, match=r"^approach: station mud is not shipped; there are cage-2x2x5, "):
+        station_of(load_scenario("approach", ("station=mud",)))
+
+
+def test_a_campaign_takes_each_scenarios_own_station_unless_one_is_given():
+    scenarios = [load_scenario("approach"), load_scenario("plate")]
+    own = plan(scenarios, ["lumidock"], (0, 1), None, CAMERA_FILE)
+    assert [shard.station.name for shard in own.shards] == [STATION.name, "plate"]
+    given = plan(scenarios, ["lumidock"], (0, 1), STATION_FILE, CAMERA_FILE)
+    assert [shard.station.name for shard in given.shards] == [STATION.name] * 2
+    assert own.shards[0].key == given.shards[0].key
+    assert own.shards[1].key != given.shards[1].key

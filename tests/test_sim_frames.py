@@ -26,7 +26,7 @@ from lumidock.streams.sources import open_source
 STATION, CAMERA = shipped_station(), shipped_camera()
 SMALL = Camera(320, 256, np.array([[273.0, 0, 159.5], [0, 273.0, 127.5], [0, 0, 1]]))
 FEW = ("path.frame_interval_s=4.0", "path.count=2", "path.hold=2")
-NOTHING, NO_STRAYS = np.empty(0, np.int64), np.empty((0, 2))
+NOTHING, NO_SPURIOUS = np.empty(0, np.int64), np.empty((0, 2))
 
 
 def head_on(z):
@@ -50,8 +50,8 @@ def written(out, name, *settings, seed=3, workers=1, camera=SMALL, video=False):
 def electrons(name, z, *settings, seed=0):
     scenario = load_scenario(name, settings)
     plan = schedule_of(scenario, STATION, SMALL, seed)
-    moment = replace(plan.moment(0), T_dock_cam=head_on(z), T_cam_later=np.eye(4))
-    return plan.studio(0).shoot(moment)
+    conditions = replace(plan.conditions(0), T_dock_cam=head_on(z), T_cam_later=np.eye(4))
+    return plan.renderer(0).expect(conditions)
 
 
 @pytest.mark.parametrize("name", [name for name in shipped_scenarios() if name != "any-roll"])
@@ -110,23 +110,23 @@ def test_snr_is_what_a_matched_filter_measures(rng):
     """Truth's ratio against the scatter of a filter's output over noisy read-outs, far, dim and among neighbours."""
     scenario = load_scenario("approach", ("output.color=false", "output.pixels=mono16", "output.file=png"))
     plan = schedule_of(scenario, STATION, CAMERA, 0)
-    studio = plan.studio(0)
-    moment = replace(plan.moment(0), T_dock_cam=head_on(26.0), T_cam_later=np.eye(4))
-    shot = studio.shoot(moment)
-    expected = shot.electrons.copy()
-    without = studio.shoot(replace(moment, dark=np.array([4]))).electrons
-    u, v = np.round(shot.seen.uv[4]).astype(int)
+    renderer = plan.renderer(0)
+    conditions = replace(plan.conditions(0), T_dock_cam=head_on(26.0), T_cam_later=np.eye(4))
+    expected = renderer.expect(conditions)
+    electrons_lit = expected.electrons.copy()
+    without = renderer.expect(replace(conditions, dark=np.array([4]))).electrons
+    u, v = np.round(expected.emitters.uv[4]).astype(int)
     box = np.s_[v - 6 : v + 7, u - 6 : u + 7]
-    ring = (expected - without)[v - 6, u - 6 : u + 7].mean()
-    signal = (expected - without)[box] - ring
+    ring = (electrons_lit - without)[v - 6, u - 6 : u + 7].mean()
+    signal = (electrons_lit - without)[box] - ring
     weight = signal / (without[box] + ring + 2.3**2)
     outputs = []
     for _ in range(400):
         noisy = rng.poisson(without[box] + ring) + rng.normal(0, 2.3, signal.shape)
         outputs.append((weight * noisy).sum())
     measured = (weight * signal).sum() / np.std(outputs)
-    assert shot.snr[4] == pytest.approx(measured, rel=0.12)
-    assert shot.snr[4] > 8
+    assert expected.snr[4] == pytest.approx(measured, rel=0.12)
+    assert expected.snr[4] > 8
 
 
 def test_more_light_around_lowers_the_snr():
@@ -143,19 +143,20 @@ def test_what_is_saturated_all_over_does_not_show():
 
 
 def test_dark_hidden_and_failed_lamps_are_not_visible(rng):
-    _, seen, snr = render_frame(load_scenario("approach"), STATION, SMALL, head_on(6.0), NO_STRAYS, np.array([2]), rng)
+    scenario, T_dock_cam = load_scenario("approach"), head_on(6.0)
+    _, seen, snr = render_frame(scenario, STATION, SMALL, T_dock_cam, NO_SPURIOUS, dark=np.array([2]), rng=rng)
     assert snr[2] == 0.0
     assert not seen.lit[2]
     assert snr[:2].min() > 100
     failed = load_scenario("approach", (*FEW, "lamps.failures={F1: 0.0, F2: 100.0}"))
-    assert schedule_of(failed, STATION, SMALL, 0).moment(1).dark.tolist() == [0]
+    assert schedule_of(failed, STATION, SMALL, 0).conditions(1).dark.tolist() == [0]
     hidden = electrons("approach", 6.0, "around.hull=0.9")
     assert hidden.snr[:7].min() < 8 < electrons("approach", 6.0).snr[:7].min()
     assert electrons("front-only", 6.0).snr[7:13].max() == 0.0
 
 
 def test_swapped_colours_are_swapped():
-    straight, swapped = electrons("approach", 6.0).seen.at_lens[:13], electrons("swapped-colors", 6.0).seen.at_lens[:13]
+    straight, swapped = (electrons(name, 6.0).emitters.at_lens[:13] for name in ("approach", "swapped-colors"))
     assert (straight[:7, 2] > 0).all()
     assert (straight[7:, 2] == 0).all()
     assert (swapped[:7, 2] == 0).all()
@@ -179,8 +180,8 @@ def test_snow_keeps_its_place_while_the_camera_moves():
     plan = schedule_of(scenario, STATION, SMALL, 0)
 
     def particles(z):
-        moment = replace(plan.moment(0), T_dock_cam=head_on(z), T_cam_later=np.eye(4))
-        seen = plan.studio(0).shoot(moment).seen
+        conditions = replace(plan.conditions(0), T_dock_cam=head_on(z), T_cam_later=np.eye(4))
+        seen = plan.renderer(0).expect(conditions).emitters
         at = seen.p_cam[seen.kind == "snow"] @ head_on(z)[:3, :3].T + head_on(z)[:3, 3]
         return {tuple(np.round(p, 6)) for p in at}
 
@@ -197,8 +198,8 @@ def test_auto_exposure_settles_at_its_mean_and_gives_way_to_bright_lamps():
     exposure_s = controlled(plan, scenario.sensor.auto_exposure, light)
     assert exposure_s[0] == pytest.approx(0.2e-3)
     settled = replace(plan, exposure_s=exposure_s)
-    shot = settled.studio(8).shoot(settled.moment(8))
-    image = settled.studio(8).develop(shot, np.random.default_rng(0))
+    expected = settled.renderer(8).expect(settled.conditions(8))
+    image = settled.renderer(8).picture_of(expected, np.random.default_rng(0))
     assert image.mean() / 255.0 == pytest.approx(0.12, rel=0.1)
     nearest = int(np.argmax([(counts * np.arange(len(counts))).sum() for counts in light]))
     assert exposure_s[nearest + 1] < 0.6 * exposure_s[8]
@@ -240,11 +241,13 @@ def knob_names(section, prefix=""):
     """Names of all knobs of a section and of those below it."""
     for name, field in section.model_fields.items():
         kinds = [kind for kind in (field.annotation, *get_args(field.annotation)) if isinstance(kind, type)]
-        below = [kind for kind in kinds if issubclass(kind, knobs.Section)]
+        below = [kind for kind in kinds if issubclass(kind, knobs.KnobSection)]
         yield from knob_names(below[0], f"{prefix}{name}.") if below else [f"{prefix}{name}"]
 
 
-@pytest.mark.parametrize("section", [name for name in Scenario.model_fields if name not in ("name", "about", "config")])
+@pytest.mark.parametrize(
+    "section", [name for name in Scenario.model_fields if name not in ("name", "about", "station", "config")]
+)
 @pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")
 def test_absurd_settings_are_refused_or_simulated(section, tmp_path):
     path = ("path.start_z_m=4", "path.end_z_m=3.5", "path.frame_interval_s=0.5")
@@ -297,7 +300,7 @@ def test_a_port_is_seen_through_and_its_calibration_is_written(tmp_path):
 
 
 def rows(n=4000, seed=1, **settings):
-    return rows_of(knobs.Stream(**settings), np.arange(n) * 150_000_000, np.random.default_rng(seed))
+    return rows_of(knobs.StreamFaults(**settings), np.arange(n) * 150_000_000, np.random.default_rng(seed))
 
 
 def test_a_sound_stream_is_complete():

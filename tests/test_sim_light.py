@@ -9,14 +9,14 @@ from scipy.integrate import trapezoid
 
 from lumidock.camera import Camera
 from lumidock.geometry import se3_inverse, so3_log
-from lumidock.sim import around, knobs, optics, sensor, water
+from lumidock.sim import knobs, optics, sensor, surroundings, water
 from lumidock.sim.canvas import Canvas, Mosaic, core_profile
 from lumidock.sim.lens import Lens, calibrated_in_water
 from lumidock.sim.scattering import backscatter_share, halo, phase_at, phase_function
 from lumidock.sim.scenario import R_DOCK_CAM_HEAD_ON, load_scenario, trajectory
 
 STATION, CAMERA = shipped_station(), shipped_camera()
-BARE = knobs.Lens(glare=0.0, ghost=0.0, falloff=0.0)
+BARE = knobs.LensKnobs(glare=0.0, ghost=0.0, falloff=0.0)
 SCENARIO = load_scenario("approach")
 MONO = knobs.Output(color=False, pixels="mono8")
 EXPOSURE_S = 2e-3
@@ -30,11 +30,11 @@ def head_on(z):
 
 
 def lens_of(lens_knobs=BARE, camera=CAMERA):
-    return Lens.of(lens_knobs, camera, water.green_index(knobs.Water()))
+    return Lens.of(lens_knobs, camera, water.green_index(knobs.WaterKnobs()))
 
 
 def lamp(p_cam, watt_sr=(0.2, 0.3, 0.2), radius_m=0.0175, lens=None):
-    view = optics.View(lens or lens_of(), np.eye(4), EXPOSURE_S)
+    view = optics.Exposure(lens or lens_of(), np.eye(4), EXPOSURE_S)
     return optics.emitters("lamp", view, np.array([p_cam]), np.array([watt_sr]), radius_m)
 
 
@@ -90,7 +90,8 @@ def flown(a, b, distance_m, kind, edges_rad, photons=400_000, seed=1):
     angle, beta = phase_function(kind)
     density = 2.0 * np.pi * beta * np.sin(angle)
     cdf = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(angle))])
-    return fly(photons, a, b, distance_m, cdf / cdf[-1], angle, edges_rad, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    return fly(photons, a, b, distance_m, cdf=cdf / cdf[-1], angle=angle, edges=edges_rad, rng=rng)
 
 
 EDGES_DEG = np.array([0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0])
@@ -157,14 +158,14 @@ def test_halos_grow_with_scattering_and_range():
 
 def test_index_is_the_known_one():
     """n of sea water at 35 psu, 20 C and 589.3 nm is 1.3394, of pure water 1.3330 (tables of Austin & Halikas 1976)."""
-    at = np.interp(589.3, water.BAND_NM, water.index(knobs.Water(salinity_psu=35.0, temperature_c=20.0)))
-    pure = np.interp(589.3, water.BAND_NM, water.index(knobs.Water(salinity_psu=0.0, temperature_c=20.0)))
+    at = np.interp(589.3, water.BAND_NM, water.index(knobs.WaterKnobs(salinity_psu=35.0, temperature_c=20.0)))
+    pure = np.interp(589.3, water.BAND_NM, water.index(knobs.WaterKnobs(salinity_psu=0.0, temperature_c=20.0)))
     assert at == pytest.approx(1.3394, abs=4e-4)
     assert pure == pytest.approx(1.3330, abs=4e-4)
 
 
 def test_salt_and_warmth_change_absorption_in_the_red():
-    cold, warm = (water.absorption_scattering(knobs.Water(temperature_c=t))[0] for t in (5.0, 25.0))
+    cold, warm = (water.absorption_scattering(knobs.WaterKnobs(temperature_c=t))[0] for t in (5.0, 25.0))
     assert warm[2] - cold[2] == pytest.approx(0.0184, rel=0.01)
     assert warm[0] == cold[0]
 
@@ -199,7 +200,7 @@ def test_beam_falls_to_half_at_its_half_angle():
         T[:3, :3] = R_DOCK_CAM_HEAD_ON @ np.array(cv2.Rodrigues(np.array([0.0, -angle, 0.0]))[0])
         T[:3, 3] = STATION.p_dock[0] + 5.0 * np.array([np.sin(angle), 0, np.cos(angle)])
         watts = optics.lamp_watts(SCENARIO, STATION, np.ones(len(STATION)), 1.0)
-        seen = optics.lamps(optics.View(lens_of(), T, EXPOSURE_S), STATION, STATION.p_dock, watts, knobs.Lamps())
+        seen = optics.lamps(optics.Exposure(lens_of(), T, EXPOSURE_S), STATION, STATION.p_dock, watts, knobs.Lamps())
         assert seen.lit[0]
         return seen.at_lens[0, 1]
 
@@ -232,7 +233,7 @@ def test_projection_agrees_with_opencv(distortion):
     T_cam_dock = se3_inverse(T)
     uv, _ = cv2.projectPoints(STATION.p_dock, so3_log(T_cam_dock[:3, :3]), T_cam_dock[:3, 3], CAMERA.K, distortion)
     watts = np.ones((len(STATION), 3))
-    view = optics.View(lens_of(camera=camera), T, EXPOSURE_S)
+    view = optics.Exposure(lens_of(camera=camera), T, EXPOSURE_S)
     seen = optics.lamps(view, STATION, STATION.p_dock, watts, knobs.Lamps())
     np.testing.assert_allclose(seen.uv, uv[:, 0], atol=1e-6)
 
@@ -247,7 +248,7 @@ def refracted(direction, n_from, n_to):
 @pytest.mark.parametrize("distance_m", [0.5, 2.0, 20.0])
 def test_the_port_bends_light_as_a_traced_ray(distance_m, rng):
     port = knobs.Port(gap_m=0.03, glass_m=0.012, glass_index=1.49)
-    lens = lens_of(knobs.Lens(port=port))
+    lens = lens_of(knobs.LensKnobs(port=port))
     assert lens.index == pytest.approx(1.342, abs=0.002)
     for uv in rng.uniform([0, 0], [CAMERA.width, CAMERA.height], (30, 2)):
         air = np.append((uv - lens.camera.center_px) / lens.camera.focal_px, 1.0)
@@ -261,7 +262,7 @@ def test_the_port_bends_light_as_a_traced_ray(distance_m, rng):
 
 
 def test_a_calibration_in_water_holds_where_it_was_made_and_no_nearer():
-    lens = lens_of(knobs.Lens(port=knobs.Port(gap_m=0.03)))
+    lens = lens_of(knobs.LensKnobs(port=knobs.Port(gap_m=0.03)))
     camera = calibrated_in_water(lens, CAMERA)
     uv = np.array([[1223.5, 1023.5], [1900.0, 1500.0], [200.0, 300.0], [2300.0, 1900.0]])
     rays = camera.unproject(uv)
@@ -277,10 +278,12 @@ def test_a_calibration_in_water_holds_where_it_was_made_and_no_nearer():
 
 def test_a_calm_surface_shows_each_lamp_where_a_mirror_would(rng):
     T = head_on(8.0)
-    surface = knobs.Surface(height_m=1.7, slope=0.0, fragments=2)
+    surface = knobs.WaterSurface(height_m=1.7, slope=0.0, fragments=2)
     watts = np.ones((len(STATION), 3))
-    view = optics.View(lens_of(), T, EXPOSURE_S, t_s=0.3)
-    cores, halos = around.mirrored(surface, 1.34, view, STATION, STATION.p_dock, watts, 0.0175, rng)
+    view = optics.Exposure(lens_of(), T, EXPOSURE_S, t_s=0.3)
+    cores, halos = surroundings.mirrored(
+        surface, 1.34, view, surroundings.LampSet(STATION, STATION.p_dock, watts, 0.0175), rng
+    )
     image = STATION.p_dock * [1, -1, 1] + [0, 3.4, 0]
     p_cam = (image - T[:3, 3]) @ T[:3, :3]
     np.testing.assert_allclose(halos.p_cam, p_cam, atol=1e-12)
@@ -291,7 +294,7 @@ def test_a_calm_surface_shows_each_lamp_where_a_mirror_would(rng):
 def test_a_surface_mirrors_all_beyond_the_critical_angle_and_two_per_cent_from_below():
     """Textbook values: 2 % at normal incidence; total reflection beyond 48.3 degrees."""
     angles = np.deg2rad([0.0, 40.0, 48.0, 48.6, 70.0])
-    back = around.fresnel(np.cos(angles), 1.34)
+    back = surroundings.fresnel(np.cos(angles), 1.34)
     assert back[0] == pytest.approx(((1.34 - 1) / (1.34 + 1)) ** 2)
     assert back[0] < back[1] < back[2] < 1.0
     assert back[3:].tolist() == [1.0, 1.0]
@@ -311,7 +314,7 @@ def test_core_profile_keeps_its_light_and_its_centre(window_px):
 
 
 def centroid(picture, near, sigma):
-    """Place of a spot by moments under a Gaussian window that follows it; symmetric spots have no bias."""
+    """Centroid by moments under a Gaussian window that is centred on it; a symmetric image gives no bias."""
     v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]
     at = near.copy()
     for _ in range(60):

@@ -16,12 +16,12 @@ from lumidock._kernels.rendering.shading import Lights, LitScene, Medium
 from lumidock.camera import Camera
 from lumidock.errors import InputError
 from lumidock.sim.knobs import Output
-from lumidock.sim.lit import compact_points
 from lumidock.sim.matter import FINISHES, Finish, Matter, Solid
+from lumidock.sim.matter_renderer import compact_points
 from lumidock.sim.scenario import R_DOCK_CAM_HEAD_ON, load_scenario
 from lumidock.sim.schedule import schedule_of
 from lumidock.sim.sequence import write_rendered
-from lumidock.sim.solids import Scene
+from lumidock.sim.solids import SolidScene
 from lumidock.sim.video import as_video, seen_by_field, woven
 from lumidock.streams.images import read_image
 
@@ -42,14 +42,20 @@ def water(beam=CLEAR):
     """Water at night."""
     none = np.zeros((2, 3))
     return Medium(
-        np.array(beam), np.zeros(3), np.ones(3), np.array([0.0, -1.0, 0.0]), 10.0, none, np.zeros((0, 2, 2, 3)),
-        np.zeros(0),
-    )  # fmt: skip
+        beam=np.array(beam),
+        surface=np.zeros(3),
+        decay=np.ones(3),
+        up=np.array([0.0, -1.0, 0.0]),
+        depth_m=10.0,
+        sideways=none,
+        lamp_sr=np.zeros((0, 2, 2, 3)),
+        edge_m=np.zeros(0),
+    )
 
 
 def seen(parts, finish, lights, medium=None, half=0.2, blocks=4, middle=(0.0, 0.0)):
     """Radiance (n, n, 3), ranges (n, n) and rays (n, n, 3) of solids in `cam`, over tangents `half` around a middle."""
-    scene = Scene.of([part.model_copy(update={"frame": "cam", "finish": "it"}) for part in parts],
+    scene = SolidScene.of([part.model_copy(update={"frame": "cam", "finish": "it"}) for part in parts],
                      Matter(finishes={"it": finish}))  # fmt: skip
     solids = scene.solids(np.eye(4))
     side = blocks * kernel.BLOCK
@@ -57,8 +63,9 @@ def seen(parts, finish, lights, medium=None, half=0.2, blocks=4, middle=(0.0, 0.
     x, y = np.meshgrid(grid + middle[0], grid + middle[1])
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
     sight = kernel.Sight(rays, np.ones(x.shape), np.eye(3), 4.0 * half / blocks, 2.0 * half / side, float(kernel.BLOCK))
-    world = LitScene(solids, scene.surfaces(), lights, medium or water(), 1e-9,
-                  kernel.no_blockers(len(lights.exponent), len(solids.kind)), np.zeros((2, 2)))  # fmt: skip
+    world = LitScene(solids, scene.surfaces(), lights, medium or water(), faint=1e-9,
+                     blockers=kernel.no_blockers(len(lights.exponent), len(solids.kind)),
+                     noise=np.zeros((2, 2)))  # fmt: skip
     picture = kernel.Picture(
         np.empty((side, side, 3), np.float32), np.empty((side, side), np.float32),
         np.zeros((blocks, blocks, 3), np.float32),
@@ -169,7 +176,7 @@ def nearest(parts, origin, rays):
                                 "end": tuple(np.array(part.end) - origin)}) for part in parts
     ]  # fmt: skip
     range_m, which = np.zeros(len(rays)), np.zeros(len(rays), np.int64)
-    kernel.first_hits(Scene.of(moved, Matter()).solids(np.eye(4)), np.ascontiguousarray(rays), range_m, which)
+    kernel.first_hits(SolidScene.of(moved, Matter()).solids(np.eye(4)), np.ascontiguousarray(rays), range_m, which)
     return range_m
 
 
@@ -222,7 +229,7 @@ def head_on(z):
 
 def shot_of(scenario, z, camera=SMALL):
     plan = schedule_of(scenario, STATION, camera, 0)
-    return plan.studio(0).shoot(replace(plan.moment(0), T_dock_cam=head_on(z), T_cam_later=np.eye(4)))
+    return plan.renderer(0).expect(replace(plan.conditions(0), T_dock_cam=head_on(z), T_cam_later=np.eye(4)))
 
 
 @pytest.mark.parametrize("name", ["approach", "headlamp", "shallow"])
@@ -247,7 +254,7 @@ def test_a_solid_hides_the_lamps_behind_it_and_their_halo():
     assert bare.snr[0] > 50.0
     assert covered.snr[0] == 0.0
     np.testing.assert_allclose(covered.snr[6], bare.snr[6], rtol=0.1)
-    u, v = np.round(bare.seen.uv[0]).astype(int)
+    u, v = np.round(bare.emitters.uv[0]).astype(int)
     assert covered.electrons[v, u] < 0.8 * bare.electrons[v, u]
 
 
@@ -267,7 +274,7 @@ def test_a_lamp_lights_what_carries_it():
     lit = shot_of(scene, 4.0, CAMERA)
     dark = shot_of(scene.model_copy(update={"lamps": scene.lamps.model_copy(update={"side_share": 0.0})}), 4.0, CAMERA)
     added = lit.electrons - dark.electrons
-    u, v = lit.seen.uv[3]
+    u, v = lit.emitters.uv[3]
     px_per_m = float(CAMERA.K[0, 0]) / 4.06
     near, far = (added[int(v + out * px_per_m), int(u)] for out in (-0.1, -0.5))
     assert p[2] == 0.0
@@ -299,7 +306,7 @@ def test_a_screw_is_noted_as_a_reflection_and_an_edge_is_not():
 def test_a_finish_that_gives_more_light_than_comes_is_refused():
     with pytest.raises(InputError, match="albedo and gloss"):
         load_scenario("approach", ("matter.finishes={it: {albedo: [0.9, 0.9, 0.9], gloss: 0.2}}",))
-    with pytest.raises(InputError, match="no finish gold"):
+    with pytest.raises(InputError, match="gold: no such finish"):
         load_scenario("approach", ("matter.solids=[{kind: box, finish: gold}]",))
     assert all(max(*f.albedo, *f.second) + f.gloss <= 1.0 for f in FINISHES.values())
 

@@ -268,14 +268,14 @@ def _sim(
     as_json: AsJson = False,
 ) -> None:
     """Simulate SCENARIO into a sequence folder with truth."""
-    from lumidock.sim.scenario import load_scenario
+    from lumidock.sim.scenario import load_scenario, station_of
     from lumidock.sim.sequence import require_possible, write_detections, write_rendered
 
     if video and detections:
         raise InputError("--video: bare detections have no pictures")
     loaded = load_scenario(scenario, tuple(settings or ()))
     require_possible(loaded, detections=detections, video=video)
-    station_file = shipped_or_path("station", station or loaded.station or DEFAULT_STATION)
+    station_file = shipped_or_path("station", station) if station else station_of(loaded)
     dock = load_station(station_file)
     lens = load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))
     prepare_sequence(out, force)
@@ -330,7 +330,7 @@ def _campaign(
         [load_scenario(name, tuple(settings or ())) for name in scenarios],
         methods or METHODS[:1],
         _seeds(seeds),
-        shipped_or_path("station", station or DEFAULT_STATION),
+        shipped_or_path("station", station) if station else None,
         shipped_or_path("camera", camera or DEFAULT_CAMERA),
         cold=cold,
         bound=bound,

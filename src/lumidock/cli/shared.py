@@ -251,13 +251,13 @@ def tell(lines: Iterable[str]) -> None:
 
 def simulated(source: str, folder: Path, station: str | None, camera: str | None) -> Path:
     """The sequence folder that `sim:SCENARIO[:SEED]` stands for, simulated into `folder`. Raises: InputError."""
-    from lumidock.sim.scenario import load_scenario
+    from lumidock.sim.scenario import load_scenario, station_of
     from lumidock.sim.sequence import write_rendered
 
     name, colon, seed = source.removeprefix(SIM).rpartition(":")
     name, seed = (name, seed) if colon and seed.isdecimal() else (source.removeprefix(SIM), "0")
     scenario = load_scenario(name, ())
-    station_file = shipped_or_path("station", station or scenario.station or DEFAULT_STATION)
+    station_file = shipped_or_path("station", station) if station else station_of(scenario)
     dock, lens = load_station(station_file), load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))
     prepare_sequence(folder, True)
     copy(station_file, folder / "station.yaml")

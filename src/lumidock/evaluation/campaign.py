@@ -36,7 +36,7 @@ from lumidock.evaluation.counts import SimulatedRun, Tally, tally_run
 from lumidock.evaluation.cramer_rao import Bound
 from lumidock.methods import Method, implementation, localizer_of
 from lumidock.sim.detections import SimulatedFrame, simulated_frames
-from lumidock.sim.scenario import Scenario
+from lumidock.sim.scenario import Scenario, station_of
 from lumidock.station import Station, load_station
 from lumidock.yamlfile import validate
 
@@ -119,22 +119,33 @@ def plan(
     scenarios: Sequence[Scenario],
     methods: Sequence[str],
     seeds: tuple[int, int],
-    station_file: Path,
+    station_file: Path | None,
     camera_file: Path,
     *,
     cold: bool = False,
     bound: bool = False,
 ) -> Campaign:
-    """Cut scenarios x methods x the seeds from `seeds[0]` to before `seeds[1]` into shards. Raises: InputError."""
-    station, camera = load_station(station_file), load_camera(camera_file)
-    inputs = {path.name: _digest(path.read_bytes()) for path in (station_file, camera_file)}
+    """Cut scenarios x methods x the seeds from `seeds[0]` to before `seeds[1]` into shards. Raises: InputError.
+
+    Without a `station_file` every scenario is simulated on the station that it is made for.
+    """
+    camera = load_camera(camera_file)
+    stations = [station_file or station_of(scenario) for scenario in scenarios]
+    inputs = {path.name: _digest(path.read_bytes()) for path in (*stations, camera_file)}
     shared = {"lumidock": f"{version('lumidock')}+{source_digest()}", "inputs": inputs, "cold": cold, "bound": bound}
     shards = []
-    for scenario in dict.fromkeys(scenario.model_dump_json() for scenario in scenarios):
-        parsed = Scenario.model_validate_json(scenario)
+    unique = {scenario.model_dump_json(): path for scenario, path in zip(scenarios, stations, strict=True)}
+    for scenario, path in unique.items():
+        parsed, station = Scenario.model_validate_json(scenario), load_station(path)
+        own_inputs = {name: inputs[name] for name in (path.name, camera_file.name)}
         config = validate(Config, parsed.config, f"{parsed.name}: config")
         for method in dict.fromkeys(methods):
-            what = shared | {"scenario": scenario, "config": config.model_dump_json(), "method": method}
+            what = shared | {
+                "inputs": own_inputs,
+                "scenario": scenario,
+                "config": config.model_dump_json(),
+                "method": method,
+            }
             if code := implementation(method):
                 what |= {"implementation": code}
             for first, stop in _blocks(seeds):

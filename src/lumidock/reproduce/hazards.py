@@ -10,7 +10,7 @@ from lumidock.reproduce.detector import detector_table
 from lumidock.reproduce.jobs import Job
 from lumidock.reproduce.plan import Plan
 from lumidock.reproduce.work import Simulation, campaign, docking, docking_leaves
-from lumidock.sim.measured import measured_like
+from lumidock.sim.measured import is_measured, measured_like
 from lumidock.sim.scenario import load_scenario, shipped_scenarios
 
 _METHODS = ("lumidock",)
@@ -52,7 +52,7 @@ def _point_level(plan: Plan) -> list[Job]:
     jobs = []
     for name in shipped_scenarios():
         scenario = load_scenario(name)
-        if scenario.path.kind == "draws":
+        if scenario.path.kind == "draws" or not is_measured(scenario):
             continue
         settings = (f"detections.detector={measured_like(scenario)}",)
         seeds = range(plan.grid.first_seed, plan.grid.first_seed + plan.grid.point_seeds)

@@ -25,7 +25,7 @@ from lumidock.methods import Method, localizer_of
 from lumidock.reproduce.plan import Dock, resolved
 from lumidock.reproduce.trials import verdict
 from lumidock.sim.detections import simulated_frames
-from lumidock.sim.scenario import Scenario, load_scenario, spurious_paths, trajectory
+from lumidock.sim.scenario import Scenario, load_scenario, spurious_paths, station_of, trajectory
 from lumidock.sim.sequence import file_of, render_frame, rendered
 from lumidock.sim.stream import Row
 from lumidock.station import Station, load_station
@@ -49,8 +49,13 @@ class Simulation:
     seed: int
 
     def load(self) -> tuple[Scenario, Station, Camera]:
-        """Raises: InputError for what is refused."""
-        return load_scenario(self.scenario, self.settings), *self.dock.load()
+        """The scenario, the station that it names or else that of the dock, and the camera. Raises: InputError."""
+        scenario = load_scenario(self.scenario, self.settings)
+        return scenario, load_station(self.station_file(scenario)), load_camera(Path(self.dock.camera))
+
+    def station_file(self, scenario: Scenario) -> Path:
+        """The station that the scenario names, else that of the dock."""
+        return station_of(scenario) if scenario.station else Path(self.dock.station)
 
 
 def machine() -> str:
@@ -84,7 +89,8 @@ def campaign(simulation: Simulation) -> dict[str, Any]:
     """One seed of a shipped scenario at point level by our method: a row of a campaign's table."""
     dock, tally, seed = simulation.dock, Tally(), simulation.seed
     scenario = load_scenario(simulation.scenario, simulation.settings)
-    for shard in plan([scenario], ["lumidock"], (seed, seed + 1), Path(dock.station), Path(dock.camera)).shards:
+    files = simulation.station_file(scenario), Path(dock.camera)
+    for shard in plan([scenario], ["lumidock"], (seed, seed + 1), *files).shards:
         tally.merge(Tally.from_dict(run_shard(shard)["tally"]))
     return row_of(tally)
 
@@ -99,7 +105,8 @@ def docking(simulation: Simulation, folder: str, keep: bool, methods: Methods, c
     shutil.rmtree(place, ignore_errors=True)
     sequence = place / "sequence"
     sequence.mkdir(parents=True)
-    shutil.copyfile(simulation.dock.station, sequence / "station.yaml")
+    station_file = simulation.station_file(scenario)
+    shutil.copyfile(station_file, sequence / "station.yaml")
     pictures = rendered(scenario, station, camera, simulation.seed, sequence)
     if keep:
         (sequence / "frames").mkdir()
@@ -107,7 +114,7 @@ def docking(simulation: Simulation, folder: str, keep: bool, methods: Methods, c
             (sequence / "frames" / file_of(row, scenario)).write_bytes(content)
     result: dict[str, Any] = {"machine": machine()}
     for name in methods:
-        setup = Setup(*_setup(name, config), Path(simulation.dock.station), sequence / "camera.yaml")
+        setup = Setup(*_setup(name, config), station_file, sequence / "camera.yaml")
         result[name] = _run_method(setup, pictures, place / name)
     return result
 

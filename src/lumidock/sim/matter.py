@@ -1,40 +1,42 @@
-"""Knobs of what the lamps, the day and the vehicle's own lamp shine on: solids, their finish, and ready-made docks."""
+"""Settings of the solid bodies in a scenario: docks, walls, ropes, hull, jellyfish, and how their surfaces reflect."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, model_validator
+from typing_extensions import Self
 
-from lumidock.sim.knobs import Counts, Lengths, Place, Probability, Section, Sizes
+from lumidock.sim.knobs import Counts, KnobSection, Lengths, Place, Probability, Sizes
 
 Reflectances = tuple[Probability, Probability, Probability]
-Small = Annotated[float, Field(gt=0.0, le=1000.0)]
+WallDistance = Annotated[float, Field(ge=0.0, le=900.0)]
+Extent = Annotated[float, Field(gt=0.0, le=1000.0)]
 Period = Annotated[float, Field(ge=1e-3, le=100.0)]
 
 
-class Finish(Section):
-    """How a surface reflects, at 455, 530 and 610 nm."""
+class Finish(KnobSection):
+    """How a surface reflects; three values are those at 455, 530 and 610 nm."""
 
     albedo: Reflectances = (0.5, 0.5, 0.5)  # diffuse reflectance
-    gloss: Probability = 0.0  # share of head-on light in the glossy lobe; wet paint about 0.02, metal 0.3-0.6
-    shininess: Annotated[float, Field(ge=1.0, le=1e5)] = 50.0  # exponent of that lobe: satin 20, polished 1000
+    gloss: Probability = 0.0  # glossy reflectance head-on; wet paint about 0.02, metal 0.3-0.6
+    shininess: Annotated[float, Field(ge=1.0, le=1e5)] = 50.0  # exponent of the glossy lobe: satin 20, polished 1000
     pattern: Literal["plain", "tiles", "sectors", "stripes"] = "plain"
-    second: Reflectances = (0.1, 0.1, 0.1)  # albedo of joints, dark sectors or stripes
-    period: Period = 0.2  # m between joints or stripes, rad between sectors
-    share: Probability = 0.05  # of a period that is joint, dark sector or stripe
-    mottle: Probability = 0.0  # relative depth of stains
-    mottle_m: Small = 0.5  # and their largest size
+    second: Reflectances = (0.1, 0.1, 0.1)  # albedo of the pattern's joints, sectors or stripes
+    period: Period = 0.2  # of the pattern: m for tiles and stripes, rad for sectors
+    share: Probability = 0.05  # share of a period that has the albedo `second`
+    mottle: Probability = 0.0  # relative change of the albedo by stains
+    mottle_m: Extent = 0.5  # size of the largest stains, m
 
     @model_validator(mode="after")
-    def _no_more_light_than_comes(self) -> Self:
+    def _reflects_no_more_than_it_receives(self) -> Self:
         if max(*self.albedo, *self.second) + self.gloss > 1.0:
-            raise ValueError("wanted albedo and gloss that add up to no more than 1")
+            raise ValueError("albedo and gloss have to add up to no more than 1")
         return self
 
 
-# Reflectances: white paint 0.8, concrete 0.2-0.4, oxidised steel 0.1-0.2, black plastic 0.03-0.05 (CRC Handbook of
-# Chemistry and Physics, emissivity and albedo tables); glazed tile and wet paint reflect 2 % at an interface with water
+# Diffuse reflectances: white paint 0.8, concrete 0.2-0.4, oxidised steel 0.1-0.2, black plastic 0.03-0.05 (CRC Handbook
+# of Chemistry and Physics, tables of emissivity and albedo). Under water, tiles and wet paint reflect 2 % head-on.
 FINISHES = {
     "white": Finish(albedo=(0.75, 0.78, 0.78), gloss=0.03, shininess=60.0),
     "grey": Finish(albedo=(0.35, 0.36, 0.36), gloss=0.03, shininess=40.0),
@@ -69,12 +71,12 @@ FINISHES = {
 }  # fmt: skip
 
 
-class Solid(Section):
-    """One solid in the frame of the dock, or of the camera.
+class Solid(KnobSection):
+    """One solid, given in the frame `dock` or `cam`, in metres.
 
-    A box has its `center`, `half_m` and is turned so that its local z is `axis`; a tube or cone runs from `center`
-    to `end`, with `radius_m` at both; a ring lies around `center` across `axis`, between the two of `radius_m`; an
-    ellipsoid has `half_m` as its semi-axes.
+    box: half lengths `half_m` around `center`; its local z axis is `axis`. tube: a cylinder or cone without end caps
+    from `center` to `end`, with the two radii `radius_m` there. ring: flat, around `center` and normal to `axis`, with
+    inner and outer radius `radius_m`. ellipsoid: semi-axes `half_m` around `center`.
     """
 
     kind: Literal["box", "tube", "ring", "ellipsoid"]
@@ -83,57 +85,57 @@ class Solid(Section):
     center: Place = (0.0, 0.0, 0.0)
     end: Place = (0.0, 0.0, -1.0)
     axis: Place = (0.0, 0.0, 1.0)
-    half_m: tuple[Small, Small, Small] = (0.1, 0.1, 0.1)
+    half_m: tuple[Extent, Extent, Extent] = (0.1, 0.1, 0.1)
     radius_m: tuple[NonNegativeFloat, NonNegativeFloat] = (0.02, 0.02)
 
     @model_validator(mode="after")
     def _has_an_extent(self) -> Self:
         if self.kind == "tube" and self.center == self.end:
-            raise ValueError("wanted an end that is not the center")
+            raise ValueError("end: has to differ from center")
         if max(map(abs, self.axis)) == 0.0:
-            raise ValueError("axis has no direction")
+            raise ValueError("axis: has to differ from zero")
         if self.kind in ("tube", "ring") and max(self.radius_m) == 0.0:
-            raise ValueError("radius_m: wanted one over 0")
+            raise ValueError("radius_m: one of the two has to be over 0")
         return self
 
 
-class Basin(Section):
-    """Walls and floor around the dock; a wall at 0 is left out."""
+class Basin(KnobSection):
+    """Walls and floor of a pool or a channel around the dock; a distance of 0 leaves out the wall or the floor."""
 
-    back_m: NonNegativeFloat = 3.0  # of the wall behind the dock, from its origin
-    side_m: NonNegativeFloat = 4.0  # of the walls left and right
-    floor_m: NonNegativeFloat = 2.5  # below the dock's origin
-    wall: str = "tiles"  # finishes
-    floor: str = "tiles"
+    back_m: WallDistance = 3.0  # from the dock's origin back to the wall behind it
+    side_m: WallDistance = 4.0  # from the dock's origin to the walls left and right
+    floor_m: WallDistance = 2.5  # from the dock's origin down to the floor
+    wall: str = "tiles"  # name of a finish
+    floor: str = "tiles"  # name of a finish
 
 
-class Jellyfish(Section):
-    """Pale bodies that drift before the camera."""
+class Jellyfish(KnobSection):
+    """Jellyfish: pale, opaque ellipsoids that drift in front of the camera."""
 
-    count: Counts = (4, 4)
+    count: Counts = (4, 4)  # drawn once a run
     radius_m: Sizes = (0.05, 0.15)
     distance_m: Sizes = (1.5, 6.0)  # from the camera
     speed_m_s: Lengths = (0.02, 0.1)
 
 
-class Matter(Section):
-    """Solid things in view; none of them by default."""
+class Matter(KnobSection):
+    """The solid bodies in view; there are none by default."""
 
-    dock: Literal["none", "cage", "funnel", "plate"] = "none"
+    dock: Literal["none", "cage", "funnel", "plate"] = "none"  # a body built around the lights of the station
     basin: Basin | None = None
-    ropes: bool = False  # that hold the dock from above
-    hull: bool = False  # the own vehicle's yellow nose below the camera
+    ropes: bool = False  # two ropes that hold the dock from above
+    hull: bool = False  # the own vehicle's yellow nose, below the camera
     jellyfish: Jellyfish | None = None
     solids: tuple[Solid, ...] = ()
-    finishes: dict[str, Finish] = Field(default_factory=dict)  # by name, in place of the known ones or beside them
+    finishes: dict[str, Finish] = Field(default_factory=dict)  # by name; they replace shipped ones
 
     @property
-    def is_any(self) -> bool:
-        """Whether there is anything to draw."""
+    def is_present(self) -> bool:
+        """Whether there is any solid to draw."""
         return bool(self.dock != "none" or self.basin or self.ropes or self.hull or self.jellyfish or self.solids)
 
     def finish(self, name: str) -> Finish:
-        """The finish of a name."""
+        """The finish with this name, from the scenario or among those that are shipped."""
         return self.finishes.get(name) or FINISHES[name]
 
     @model_validator(mode="after")
@@ -141,5 +143,5 @@ class Matter(Section):
         basin = [self.basin.wall, self.basin.floor] if self.basin else []
         for name in [*(solid.finish for solid in self.solids), *basin]:
             if name not in self.finishes and name not in FINISHES:
-                raise ValueError(f"no finish {name}; there are {', '.join([*FINISHES, *self.finishes])}")
+                raise ValueError(f"{name}: no such finish; there are {', '.join([*FINISHES, *self.finishes])}")
         return self

@@ -1,6 +1,6 @@
-"""What the default detector makes of lights, as measured on rendered frames, for bare detections that err as it does.
+"""Errors of the default detector as measured on rendered frames, for bare detections with the same errors.
 
-A table lies beside this file; `python -m bench detector-errors` measures it anew and says on which frames.
+The measurements are in detector_errors.json beside this file, which `python -m bench detector-errors` writes.
 """
 
 from __future__ import annotations
@@ -19,25 +19,18 @@ from lumidock.errors import InputError
 from lumidock.sim.scenario import Scenario, load_scenario
 
 TABLE = "detector_errors.json"
-KINDS = ("front", "rear", "false")  # spots of lights by layer, and those of nothing that the scenario calls a light
-_PICTURE = {
-    "water",
-    "daylight",
-    "lamps",
-    "around",
-    "matter",
-    "lens",
-    "sensor",
-    "output",
-}  # what decides how a light looks
+KINDS = ("front", "rear", "false")  # detections of front lights, of other lights, and of no light
+# parts of a scenario on which the image of a light depends
+_IMAGE_PARTS = {"station", "water", "daylight", "lamps", "around", "matter", "lens", "sensor", "output"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionTable:
-    """S spots, those of one frame in a row.
+    """S detections of all frames, in the order of the frames.
 
-    The `frame` of each (S,), true pixels `uv` (S, 2), its `light` (S,), -1 for none, and how far away that is,
-    `range_m` (S,): of a false spot of the detector how far the dock is, of a spurious light NaN.
+    The number `frame` (S,) of the frame, true pixels `uv` (S, 2), the index `light` (S,) of the light, -1 for none, and
+    the range of that light, `range_m` (S,) m. For a false detection of the detector it is the range of the dock, for a
+    spurious light of the scenario NaN.
     """
 
     frame: Indices
@@ -48,7 +41,7 @@ class DetectionTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Appearance:
-    """What the detector says of S spots: errors `off_px` (S, 2), `cov_px2` (S, 2, 2), `p_light` and `p_rear` (S,)."""
+    """Values of S detections: errors of centroids `off_px` (S, 2), `cov_px2` (S, 2, 2), `p_light`, `p_rear` (S,)."""
 
     off_px: Array
     cov_px2: Array | None
@@ -58,10 +51,11 @@ class Appearance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cell:
-    """One kind of spot in one band of range.
+    """Measurements of one kind of detection in one band of range.
 
-    `rate`: the share of lights that are found, or false spots a frame; `spots` (K, 4) found ones: sigma px along the
-    error by the covariance, error of the centre over that (0 for false ones), p_light, and p_rear (NaN: unknown).
+    `rate`: the share of lights that are detected, or the number of false detections per frame. `detections` (K, 4): of
+    each its sigma px in the direction of its error, the error of the centroid over this sigma (0 for false ones),
+    p_light and p_rear (NaN: unknown).
     """
 
     rate: float
@@ -70,7 +64,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectorErrors:
-    """Cells by kind and band; `edges_m` are where the bands of range begin, the last has no end."""
+    """Cells by kind and band of range; each band begins at one of `edges_m`, the last one has no end."""
 
     edges_m: Array
     cells: dict[str, tuple[Cell, ...]]
@@ -84,12 +78,12 @@ class DetectorErrors:
         return np.asarray(np.array([cell.rate for cell in self.cells[kind]])[self.band(range_m)])
 
     def found(self, rear: np.ndarray, range_m: Array, rng: np.random.Generator) -> np.ndarray:
-        """Which lights (N, M) at ranges `range_m` (N, M) are found if lit; which are `rear` (M,)."""
+        """Which lights (N, M) at ranges `range_m` (N, M) are detected if lit, at random; `rear` (M,) are not front."""
         rate = np.where(rear, self.rate("rear", range_m), self.rate("front", range_m))
         return np.asarray(rng.random(range_m.shape) < rate)
 
     def draw(self, kind: str, range_m: Array, rng: np.random.Generator) -> Array:
-        """One of the measured spots (N, 4) for each range (N,)."""
+        """One measured detection (N, 4) for each range (N,), drawn at random from its band."""
         band, drawn = self.band(range_m), np.full((len(range_m), 4), np.nan)
         for k, cell in enumerate(self.cells[kind]):
             here = np.flatnonzero(band == k)
@@ -100,14 +94,18 @@ class DetectorErrors:
 
 @cache
 def measured_table() -> dict[str, Any]:
-    """The file: `about`, `edges_m`; by scenario, kind and band how many there were, were seen, and some of these."""
+    """The content of the file.
+
+    `about`, `edges_m`, and by scenario, kind and band: how many lights (or frames) there were, `of`, how many
+    detections, `seen`, and a sample of these, `detections`.
+    """
     content: dict[str, Any] = json.loads((files("lumidock.sim") / TABLE).read_text(encoding="utf-8"))
     return content
 
 
 @cache
 def detector_errors(name: str) -> DetectorErrors:
-    """What was measured on frames of the shipped scenario `name`. Raises: InputError when it was not."""
+    """Measurements on frames of the shipped scenario `name`. Raises: InputError when there are none."""
     table = measured_table()
     if name not in table["scenarios"]:
         raise InputError(f"detections.detector: {name} is not measured; there are {', '.join(table['scenarios'])}")
@@ -116,29 +114,34 @@ def detector_errors(name: str) -> DetectorErrors:
 
 
 def _cell(content: dict[str, Any]) -> Cell:
-    """Where nothing was found nothing will be."""
+    """One cell; a band without lights or frames gets the rate 0."""
     return Cell(content["seen"] / max(content["of"], 1), np.array(content["detections"], float).reshape(-1, 4))
 
 
 def measured_like(scenario: Scenario) -> str:
-    """The measured scenario whose lights look like those of `scenario`. Raises: InputError when there is none."""
+    """Name of a measured scenario with the same images of lights as `scenario`. Raises: InputError without one."""
     for name in measured_table()["scenarios"]:
         if same_picture(load_scenario(name), scenario):
             return str(name)
     raise InputError(f"{scenario.name}: no detector errors were measured on such pictures")
 
 
+def is_measured(scenario: Scenario) -> bool:
+    """Whether detector errors were measured on pictures like those of `scenario`."""
+    return any(same_picture(load_scenario(name), scenario) for name in measured_table()["scenarios"])
+
+
 def same_picture(one: Scenario, other: Scenario) -> bool:
-    """Whether a light looks the same in both; path and faults may differ."""
-    return one.model_dump(include=_PICTURE) == other.model_dump(include=_PICTURE)
+    """Whether images of lights are alike in both; path and faults may differ."""
+    return one.model_dump(include=_IMAGE_PARTS) == other.model_dump(include=_IMAGE_PARTS)
 
 
 def with_false(
     detections: DetectionTable, errors: DetectorErrors, dock_m: Array, camera: Camera, rng: np.random.Generator
 ) -> DetectionTable:
-    """The same and false spots, anywhere in the picture and new in each frame.
+    """Add false detections, anywhere in the picture and new in each frame.
 
-    `dock_m` (N,) is how far the dock is from the camera in each frame, NaN in black ones, which have none.
+    `dock_m` (N,) is the range m of the dock in each frame; it is NaN in black frames, which get no false detections.
     """
     rate = np.where(np.isnan(dock_m), 0.0, errors.rate("false", dock_m))
     false = np.repeat(np.arange(len(rate)), rng.poisson(rate))
@@ -158,17 +161,17 @@ def as_measured(
     noise_px: float,
     rng: np.random.Generator,
 ) -> Appearance:
-    """Like `looks`, but lights, of which some are `rear` (M,), and false spots as measured.
+    """Replace the errors of lights and false detections by measured ones; which lights are `rear` (M,).
 
-    Spurious lights keep what the scenario says of them, with `noise_px` as their sigma.
+    Spurious lights of the scenario keep their `appearance`, with `noise_px` as their sigma.
     """
-    n, light, stray = len(detections.light), detections.light >= 0, np.isnan(detections.range_m)
+    n, light, injected = len(detections.light), detections.light >= 0, np.isnan(detections.range_m)
     drawn = np.stack([np.full(n, noise_px), np.zeros(n), appearance.p_light, appearance.p_rear], axis=1)
     of_rear = light & rear[detections.light]
-    for kind, which in (("front", light & ~of_rear), ("rear", of_rear), ("false", ~light & ~stray)):
+    for kind, which in (("front", light & ~of_rear), ("rear", of_rear), ("false", ~light & ~injected)):
         drawn[which] = errors.draw(kind, detections.range_m[which], rng)
     sigma_px, over, p_light, p_rear = drawn.T
     way = rng.uniform(0.0, 2.0 * np.pi, n)
     off_px = (sigma_px * over)[:, None] * np.stack([np.cos(way), np.sin(way)], axis=1)
-    off_px[stray] = appearance.off_px[stray]
+    off_px[injected] = appearance.off_px[injected]
     return Appearance(off_px, sigma_px[:, None, None] ** 2 * np.eye(2), p_light, p_rear)

@@ -1,4 +1,4 @@
-"""Radiometry of everything that shines like a lamp: how much light of it reaches the lens, and where."""
+"""Radiometry of lamps and other small sources: how much of their light reaches the lens, and where its image is."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lumidock.sim.water import BAND_NM
 from lumidock.station import Station
 
 PHOTON_J = 6.62607e-34 * 2.99792e8 / (BAND_NM * 1e-9)
-# share of a lamp's radiant power in each band
+# share of a lamp's radiant power in each band, by its colour
 SPECTRUM = {
     "white": (0.30, 0.40, 0.30),
     "blue": (0.97, 0.03, 0.0),
@@ -27,8 +27,8 @@ SPECTRUM = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """From where, when and how long is looked: pose `T_dock_cam` (4, 4), `t_s` since the start, `exposure_s`."""
+class Exposure:
+    """One exposure through a lens: pose `T_dock_cam` (4, 4), its length `exposure_s`, time `t_s` since the start."""
 
     lens: Lens
     T_dock_cam: Array
@@ -36,17 +36,18 @@ class View:
     t_s: float = 0.0
 
     def p_cam(self, p_dock: Array) -> Array:
-        """Points (N, 3) of the dock as the camera has them."""
+        """Points `p_cam` (N, 3) of points `p_dock` (N, 3)."""
         return transform_points(se3_inverse(self.T_dock_cam), p_dock)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Emitters:
-    """N small bright things in one frame.
+    """N small sources of light in one frame.
 
-    `kind` (N,), `p_cam` (N, 3) m, pixels `uv` (N, 2), photons `at_lens` (N, 3) in each band that would enter the
-    aperture during the exposure if there were no water, the length `range_m` (N,) of their way, the radius
-    `window_px` (N,), shares of the light drawn as `core` and as `halo` (N,), and which are `lit` (N,) and in view.
+    `kind` (N,): a word of spurious_truth.csv, or "lamp" for the station's own; `p_cam` (N, 3) m; pixels `uv` (N, 2);
+    `at_lens` (N, 3): photons in each band that would enter the aperture during the exposure if there were no water;
+    `range_m` (N,); `window_px` (N,): radius of the image; `core`, `halo` (N,): shares of the direct image and of the
+    scattered light that are drawn; `lit` (N,): whether it shines and its image is in the picture.
     """
 
     kind: np.ndarray
@@ -64,19 +65,19 @@ class Emitters:
 
 
 def joined(parts: list[Emitters]) -> Emitters:
-    """All of them in a row."""
+    """All emitters of `parts`, in this order."""
     return Emitters(*(np.concatenate([getattr(part, name) for part in parts]) for name in Emitters.__slots__))
 
 
 def beam_exponent(beam_deg: Array | float) -> Array:
-    """Exponent n of cos^n, a beam that has half its intensity at half of `beam_deg`, of any shape."""
+    """Exponent n of a beam cos^n whose full width at half maximum is `beam_deg`; arrays of any shape."""
     return np.asarray(np.log(0.5) / np.log(np.cos(np.deg2rad(np.minimum(beam_deg, 179.0)) / 2.0)))
 
 
 def intensity(power_w: Array, beam_deg: Array, cosine: Array, side_share: float = 0.0) -> Array:
-    """Radiant intensity (N,) W/sr at the `cosine` of the angle to the axis: P (n + 1) / 2 pi cos^n.
+    """Radiant intensity (N,) W/sr at the `cosine` of the angle to the axis: P (n + 1) / (2 pi) cos^n.
 
-    Of the power, `side_share` goes evenly into all directions.
+    The part `side_share` of the power P goes evenly into all directions instead, P / (4 pi).
     """
     n = beam_exponent(beam_deg)
     beam = np.asarray(power_w * (n + 1.0) / (2.0 * np.pi) * np.maximum(cosine, 0.0) ** n)
@@ -85,7 +86,7 @@ def intensity(power_w: Array, beam_deg: Array, cosine: Array, side_share: float 
 
 def emitters(
     kind: str,
-    view: View,
+    exposure: Exposure,
     p_cam: Array,
     watt_sr: Array,
     radius_m: Array | float,
@@ -93,29 +94,32 @@ def emitters(
     core: Array | float = 1.0,
     halo: Array | float = 1.0,
 ) -> Emitters:
-    """Emitters at `p_cam` (N, 3) with intensities `watt_sr` (N, 3) in each band toward the camera."""
-    lens, distance = view.lens, np.maximum(np.linalg.norm(p_cam, axis=1), 1e-3)
+    """Emitters of `radius_m` at `p_cam` (N, 3) with intensities `watt_sr` (N, 3) W/sr toward the camera."""
+    lens, distance = exposure.lens, np.maximum(np.linalg.norm(p_cam, axis=1), 1e-3)
     uv = lens.project(p_cam)
     lit = lens.camera.contains(uv) & (watt_sr.sum(axis=1) > 0.0)
     at = np.where(lit[:, None], uv, lens.camera.center_px)
-    photons = watt_sr / distance[:, None] ** 2 * lens.aperture_m2 * view.exposure_s / PHOTON_J
-    pupil = np.sqrt(lens.aperture_m2 / np.pi)  # focused far away: what is near is blurred to the size of the pupil
+    photons = watt_sr / distance[:, None] ** 2 * lens.aperture_m2 * exposure.exposure_s / PHOTON_J
+    pupil = np.sqrt(lens.aperture_m2 / np.pi)  # near points are blurred to the size of the pupil
     size = np.hypot(radius_m, pupil) / distance / np.sqrt(lens.solid_angle(at))
     return Emitters(
-        np.full(len(p_cam), kind),
-        p_cam,
-        uv,
-        photons * lens.throughput(at)[:, None],
-        distance,
-        size,
-        np.broadcast_to(np.asarray(core, float), len(p_cam)),
-        np.broadcast_to(np.asarray(halo, float), len(p_cam)),
-        lit,
+        kind=np.full(len(p_cam), kind),
+        p_cam=p_cam,
+        uv=uv,
+        at_lens=photons * lens.throughput(at)[:, None],
+        range_m=distance,
+        window_px=size,
+        core=np.broadcast_to(np.asarray(core, float), len(p_cam)),
+        halo=np.broadcast_to(np.asarray(halo, float), len(p_cam)),
+        lit=lit,
     )
 
 
 def lamp_watts(scenario: Scenario, station: Station, transmission: Array, duty: float) -> Array:
-    """Radiant power (M, 3) W of the station's lamps in each band, `duty` the share of the exposure they are on."""
+    """Radiant power (M, 3) W of the station's M lamps in each band, averaged over the exposure.
+
+    `transmission` (M,) is that of their windows, `duty` the share of the exposure during which they are on.
+    """
     color: tuple[str, ...] = station.color
     if scenario.lamps.swap_colors:
         order = station.layers_front_to_rear()
@@ -126,13 +130,16 @@ def lamp_watts(scenario: Scenario, station: Station, transmission: Array, duty: 
 
 
 def _swapped(station: Station, other: dict[str, str]) -> tuple[str, ...]:
-    """Each light's colour, which is that of the first light of the `other` layer."""
+    """Colour of each light where each layer has the colour of the `other` layer: that of its first light."""
     first = {name: station.color[int(station.lights_of(name)[0])] for name in other}
     return tuple(first[other[station.layers[layer]]] for layer in station.layer)
 
 
 def on_share(pwm_hz: float, duty: float, start_s: float, exposure_s: float) -> float:
-    """Share of the exposure during which pulse-width modulated lamps are on; they start a period being on."""
+    """Share of an exposure from `start_s` on during which pulse-width modulated lamps are on.
+
+    Each period begins with the pulse; the first one begins at time zero.
+    """
     if pwm_hz == 0.0:
         return duty
 
@@ -143,8 +150,8 @@ def on_share(pwm_hz: float, duty: float, start_s: float, exposure_s: float) -> f
     return (on_until(start_s + exposure_s) - on_until(start_s)) / exposure_s
 
 
-def lamps(view: View, station: Station, p_dock: Array, watts: Array, knobs: Lamps) -> Emitters:
-    """The station's M lamps, which stand at `p_dock` (M, 3) and have `watts` (M, 3) in each band."""
-    cosine = emission_cosine(p_dock, station.axis, view.T_dock_cam[:3, 3])
+def lamps(exposure: Exposure, station: Station, p_dock: Array, watts: Array, knobs: Lamps) -> Emitters:
+    """The station's M lamps, truly at `p_dock` (M, 3), with radiant power `watts` (M, 3) W in each band."""
+    cosine = emission_cosine(p_dock, station.axis, exposure.T_dock_cam[:3, 3])
     watt_sr = intensity(np.ones(len(watts)), station.beam_deg, cosine, knobs.side_share)[:, None] * watts
-    return emitters("lamp", view, view.p_cam(p_dock), watt_sr, knobs.window_radius_m)
+    return emitters("lamp", exposure, exposure.p_cam(p_dock), watt_sr, knobs.window_radius_m)

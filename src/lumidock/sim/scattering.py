@@ -1,4 +1,4 @@
-"""Scattering in water: measured phase functions, and the halo that many small deflections draw around a lamp."""
+"""Scattering in water: measured phase functions, and the halo around a lamp from single and multiple scattering."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from lumidock.datatypes import Array
 
 # T. Petzold, Volume scattering functions for selected ocean waters, SIO Ref. 72-78, 1972: 1/(m sr) at 530 nm, at 21
-# angles from 0.1 to 10 degrees evenly in their logarithm, then every 5 degrees; and the log-log slope below 0.1 degrees
+# angles from 0.1 to 10 degrees evenly in their logarithm, then every 5 degrees; before them the slope below 0.1 degrees
 _ANGLE_DEG = np.concatenate([np.logspace(-1.0, 1.0, 21), np.arange(15.0, 181.0, 5.0)])
 _PETZOLD: dict[str, tuple[float, str]] = {
     # clear: AUTEC 8, Tongue of the Ocean; coastal: HAOCE 11, Catalina Channel; harbour: NUC 2200, San Diego
@@ -37,19 +37,27 @@ _PETZOLD: dict[str, tuple[float, str]] = {
         ".003967 .004106 .004291 .004623 .005119 .005814 .006012 .006211",
     ),
 }
-# grids of the Hankel transforms, even in the logarithm: products k theta, angles where the halo is tabulated
+# Grids of the Hankel transforms, even in the logarithm: products k theta, and angles at which the halo is tabulated.
 _STEP, _STRIDE = 0.012, 12
 _PRODUCT = np.exp(np.arange(np.log(1e-5), np.log(60.0), _STEP))
 _HALO_RAD = np.exp(np.arange(96) * _STRIDE * _STEP + np.log(2e-6))
-_BLUR = 0.1  # relative width of the smoothing that lets the transforms converge; its error is of the sixth order
-_ANGLES_OF_ARC = 96
+_BLUR = 0.1  # relative width of a smoothing that makes the transforms converge; its error is of the sixth order
+_ANGLES_OF_ARC = 96  # scattering angles at which single scattering is integrated
+
+
+def integral(values: Array, at: Array) -> Array:
+    """Integral over the last axis of `values` given at the points `at`, by the trapezoidal rule.
+
+    numpy 1 and numpy 2 have this function under different names.
+    """
+    return np.asarray(((values[..., 1:] + values[..., :-1]) * np.diff(at, axis=-1) / 2.0).sum(axis=-1))
 
 
 @lru_cache
 def phase_function(kind: str) -> tuple[Array, Array]:
-    """Scattering angles rad and the phase function there 1/sr, whose integral over the sphere is one.
+    """Scattering angles (A,) rad and the phase function (A,) 1/sr there; its integral over the sphere is one.
 
-    Source: T. Petzold, 1972 (total scattering: water and particles), extended below 0.1 degrees by his own slopes.
+    Source: T. Petzold, 1972 (scattering by water and particles), extended below 0.1 degrees by his slopes.
     """
     slope, text = _PETZOLD[kind]
     measured = np.array([float(value) for value in text.split()])
@@ -60,11 +68,6 @@ def phase_function(kind: str) -> tuple[Array, Array]:
     return angle, beta / float(integral(2.0 * np.pi * beta * np.sin(angle), angle))
 
 
-def integral(values: Array, at: Array) -> Array:
-    """Integral over the last axis by the trapezoidal rule; numpy 1 and 2 have it under different names."""
-    return np.asarray(((values[..., 1:] + values[..., :-1]) * np.diff(at, axis=-1)).sum(axis=-1) / 2.0)
-
-
 def phase_at(kind: str, angle_rad: Array) -> Array:
     """The phase function 1/sr at any angles rad."""
     angle, beta = phase_function(kind)
@@ -72,7 +75,7 @@ def phase_at(kind: str, angle_rad: Array) -> Array:
 
 
 def backscatter_share(kind: str) -> float:
-    """Share of the scattered light that goes backward."""
+    """Share of the scattered light that is deflected by more than 90 degrees."""
     angle, beta = phase_function(kind)
     back = angle > np.pi / 2.0
     return float(integral(2.0 * np.pi * (beta * np.sin(angle))[back], angle[back]))
@@ -92,37 +95,39 @@ def _bessel_j0(x: Array) -> Array:
 
 @lru_cache
 def _kernel() -> Array:
-    """Weights of a Hankel transform over the products k theta."""
+    """Weights of a Hankel transform at the products k theta of `_PRODUCT`."""
     y = 0.5 * (_BLUR * _PRODUCT) ** 2
     smooth = np.exp(-y) * (1.0 + y + 0.5 * y * y)
     return np.asarray(_bessel_j0(_PRODUCT) * smooth * _PRODUCT**2 * _STEP)
 
 
 def _hankel(values: Array, variable: Array) -> Array:
-    """Integral of f(t / v) J0(t) t dt / v^2 at each `variable` v; `values` of f are those on its `_hankel_grid`.
+    """Hankel transform of order zero, integral of f(x) J0(v x) x dx, at each `variable` v.
 
-    Source: a Hankel transform on logarithmic grids is a correlation; A. Hamilton, MNRAS 312, 2000.
+    `values` are f at the points `_hankel_grid(variable)`. On logarithmic grids the transform is a correlation.
+    Source: A. Hamilton, MNRAS 312, 2000.
     """
     windows = np.lib.stride_tricks.sliding_window_view(values, len(_PRODUCT), axis=-1)[..., ::_STRIDE, :]
     return np.asarray((windows @ _kernel())[..., ::-1] / variable**2)
 
 
 def _hankel_grid(variable: Array) -> Array:
-    """Where the transformed function has to be known, for results at the `variable` (V,) that rise by the stride."""
+    """Points at which `_hankel` needs the function to be transformed, for results at each `variable` (V,)."""
     n = len(_PRODUCT) + (len(variable) - 1) * _STRIDE
     return np.asarray(_PRODUCT[0] / variable[-1] * np.exp(np.arange(n) * _STEP))
 
 
 @lru_cache
 def _path_spectrum(kind: str) -> tuple[Array, Array]:
-    """Frequencies k 1/rad and Q(k): the phase function's Hankel transform, averaged over the places along the path.
+    """Angular frequencies k 1/rad, and the Hankel transform of the phase function averaged over the path, Q(k).
 
-    A deflection by alpha at the share u of the way from the lamp is seen as u alpha.
+    Q(k) is the mean of the transform at u k over u from 0 to 1: light that is deflected by alpha at the fraction u of
+    its way from lamp to camera arrives at the angle u alpha from the lamp.
     """
     k = _hankel_grid(_HALO_RAD)
     coarse = np.exp(np.arange(0, len(k) + _STRIDE, _STRIDE) * _STEP) * k[0]
     theta = _hankel_grid(coarse)
-    flat = phase_at(kind, theta) * np.sinc(theta / np.pi)  # sin(theta) / theta: the sphere laid flat
+    flat = phase_at(kind, theta) * np.sinc(theta / np.pi)  # sin(theta) / theta maps the sphere to the plane
     spectrum = 2.0 * np.pi * _hankel(np.where(theta < np.pi, flat, 0.0), coarse)
     fine = np.interp(np.log(k), np.log(coarse), spectrum)
     sums = np.concatenate([[0.0], np.cumsum(0.5 * (fine[1:] + fine[:-1]) * np.diff(k))])
@@ -131,10 +136,12 @@ def _path_spectrum(kind: str) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=4096)
 def halo(a: float, b: float, kind: str, distance_m: float, blur_rad: float = 0.0) -> tuple[Array, Array]:
-    """Angles rad and the scattered radiance there 1/sr, over the irradiance that the lamp would give without water.
+    """Halo of an isotropic lamp: angles (A,) rad from the lamp and the relative radiance (A,) 1/sr of its halo there.
 
-    Isotropic lamp at `distance_m`, blurred by a Gaussian of `blur_rad`. Multiple scattering at small angles, in which
-    single scattering is replaced by its exact value at all angles.
+    The radiance is relative to the irradiance that the lamp would cause at the camera without water. `a` and `b` are
+    coefficients 1/m of absorption and scattering, `blur_rad` is the 1-sigma angle of the lamp's own Gaussian image. In
+    the small-angle approximation the transform of all light is exp(-(a + b) R) exp(b R Q(k)); its terms of direct light
+    and of light scattered once are subtracted, and single scattering is added exactly, at all angles.
     Source: W. Wells, J. Opt. Soc. Am. 59, 1969 and AGARD LS-61, 1973; C. Mobley, Light and Water, 1994.
     """
     k, path = _path_spectrum(kind)
@@ -150,9 +157,10 @@ def halo(a: float, b: float, kind: str, distance_m: float, blur_rad: float = 0.0
 
 
 def _single(a: float, b: float, kind: str, distance_m: float, blur_rad: float) -> Array:
-    """Light scattered once, at each of the halo's angles: b R / sin(theta) times the integral of beta over alpha.
+    """Light scattered once, at each angle theta of the halo: b R / sin(theta) integral beta(alpha) exp(-c way) dalpha.
 
-    The scattering angle alpha runs from theta to pi along the line of sight.
+    The scattering angle alpha runs from theta to pi along the line of sight; `way` is the length of the path from the
+    lamp over the point of scattering to the camera, and c = a + b.
     """
     share = np.linspace(0.0, 1.0, _ANGLES_OF_ARC)[None, :]
     theta = np.minimum(np.hypot(_HALO_RAD, 0.7 * blur_rad), 1.5)[:, None]  # the blur flattens the peak at the lamp

@@ -1,4 +1,4 @@
-"""What is simulated: the path of the camera and every knob of water, lights, camera and faults, read from YAML."""
+"""A scenario, read from YAML: the path of the camera, and settings of water, lights, camera and faults."""
 
 from __future__ import annotations
 
@@ -16,35 +16,36 @@ from lumidock.errors import InputError
 from lumidock.sim.knobs import (
     Angle,
     Angles,
-    Around,
     Counts,
     Daylight,
     Distance,
     Interval,
+    KnobSection,
     Lamps,
     Lengths,
-    Lens,
+    LensKnobs,
     Output,
     Probability,
     Reaches,
-    Section,
     Sensor,
-    Stream,
-    Water,
+    StreamFaults,
+    Surroundings,
+    WaterKnobs,
 )
 from lumidock.sim.matter import Matter
 from lumidock.yamlfile import read_mapping, validate
 
 R_DOCK_CAM_HEAD_ON = np.diag([1.0, -1.0, -1.0])
 _MAX_FRAMES = 100_000
-_BETWEEN_DRAWS_S = 60.0  # longer than any history is kept
+_DEFAULT_STATION = "cage-2x2x5"
+_BETWEEN_DRAWS_S = 60.0  # more than the time after which every track is dropped
 
 
-class Path3D(Section):
+class Path3D(KnobSection):
     """The camera's path.
 
-    `approach` runs along the dock's axis; `rectangle` goes once round at a constant z; `draws` are poses that have
-    nothing to do with each other, each with the whole front layer in view.
+    approach: along the dock's axis. rectangle: once around a rectangle at constant z. draws: independent random poses,
+    each with the whole front layer in view.
     """
 
     kind: Literal["approach", "rectangle", "draws"] = "approach"
@@ -53,25 +54,25 @@ class Path3D(Section):
     speed_m_s: PositiveFloat = 1.0
     speed_spread_m_s: NonNegativeFloat = 0.0  # a run's speed is uniform within this of speed_m_s
     frame_interval_s: PositiveFloat = 0.15
-    half_width_m: Annotated[float, Field(gt=0, le=1000)] = 9.0  # of the rectangle
+    half_width_m: Annotated[float, Field(gt=0, le=1000)] = 9.0  # half width of the rectangle
     half_height_m: Annotated[float, Field(gt=0, le=1000)] = 7.5
-    sway_m: Reaches = (0.7, 0.7, 0.0)  # largest excursion in x, y, z
-    sway_deg: Angles = (2.1, 2.1, 3.0)  # largest pitch, yaw, roll
-    near_sway_m: Reaches = (0.035, 0.035, 0.0)  # the same, at and below taper_z_m[1]
+    sway_m: Reaches = (0.7, 0.7, 0.0)  # largest deviation from the path in x, y, z, far from the dock
+    sway_deg: Angles = (2.1, 2.1, 3.0)  # largest pitch, yaw, roll, far from the dock
+    near_sway_m: Reaches = (0.035, 0.035, 0.0)  # the same from taper_z_m[1] on
     near_sway_deg: Angles = (0.35, 0.35, 0.5)
-    taper_z_m: tuple[float, float] = (15.0, 2.0)  # the sway shrinks between these
-    sway_period_s: tuple[PositiveFloat, PositiveFloat] = (7.0, 20.0)
-    count: PositiveInt = 1000  # draws
-    hold: PositiveInt = 1  # frames in a row from each draw, moving toward the dock at speed_m_s
-    hold_deg_s: NonNegativeFloat = 2.0  # largest rate in them about each axis
+    taper_z_m: tuple[float, float] = (15.0, 2.0)  # z between which the sway shrinks
+    sway_period_s: tuple[PositiveFloat, PositiveFloat] = (7.0, 20.0)  # shortest and longest period in the sway
+    count: PositiveInt = 1000  # number of draws
+    hold: PositiveInt = 1  # consecutive frames of each draw, moving toward the dock at speed_m_s
+    hold_deg_s: NonNegativeFloat = 2.0  # largest rate about each axis in these frames
     z_m: Lengths = (3.0, 19.0)  # of the draws
     turn_deg: Angles = (3.0, 3.0, 3.0)  # largest pitch, yaw, roll of the draws, each uniform
-    tilt_deg: Angle | None = None  # in place of pitch and yaw: angle uniform up to it, in a uniform direction
+    tilt_deg: Angle | None = None  # replaces pitch and yaw: largest tilt, in any direction
 
     @model_validator(mode="after")
-    def _path_can_be_walked(self) -> Self:
+    def _path_has_frames(self) -> Self:
         if self.speed_spread_m_s >= self.speed_m_s:
-            raise ValueError("speed_spread_m_s: wanted less than speed_m_s")
+            raise ValueError("speed_spread_m_s: has to be less than speed_m_s")
         if self.kind == "draws":
             if self.count * self.hold > _MAX_FRAMES:
                 raise ValueError(f"count times hold is more than {_MAX_FRAMES} frames")
@@ -90,90 +91,88 @@ class Path3D(Section):
         if self.frame_interval_s < 1e-6 or length / slowest > 1e9:
             raise ValueError("stamps of this path do not fit into nanoseconds")
         if self.taper_z_m[0] <= self.taper_z_m[1]:
-            raise ValueError("taper_z_m: wanted the farther distance first")
+            raise ValueError("taper_z_m: the larger distance has to come first")
         if self.sway_period_s[0] > self.sway_period_s[1]:
-            raise ValueError("sway_period_s: wanted the shorter period first")
+            raise ValueError("sway_period_s: the shorter period has to come first")
         return self
 
 
-class Faults(Section):
-    """What goes wrong with the lights."""
+class Faults(KnobSection):
+    """Missing and spurious lights."""
 
-    missing: Counts = (0, 0)  # front lights dark in each frame, drawn anew; the same ones in frames that are held
-    spurious: Counts = (0, 0)  # lights that wander over the whole picture, drawn for a run; in draws anew in each frame
-
-
-class AttitudeSensor(Section):
-    """The vehicle's own compass and tilt sensors, 1 sigma about each axis."""
-
-    bias_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 2.0  # one for a run
-    noise_deg: Angle = 0.1  # in each frame
+    missing: Counts = (0, 0)  # front lights that are dark, drawn in each frame, once for the frames of a draw
+    spurious: Counts = (0, 0)  # that wander over the picture, drawn once a run; in a path of draws in each frame
 
 
-class BlackOuts(Section):
-    """Times in which no spot is seen at all."""
+class AttitudeSensor(KnobSection):
+    """Errors of the vehicle's own compass and tilt sensors, 1 sigma about each axis."""
 
-    at_s: tuple[Interval, ...] = ()  # from and to, since the start
-    count: Counts = (0, 0)  # further ones in a run, anywhere in it ...
-    length_s: Lengths = (0.2, 2.0)  # ... and how long each is
+    bias_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 2.0  # constant through a run
+    noise_deg: Angle = 0.1  # independent in each frame
 
 
-class DetectionKnobs(Section):
-    """Bare detections, made without rendering. What is drawn for a run is drawn for each draw of a path of draws."""
+class BlackOuts(KnobSection):
+    """Times in which nothing is detected."""
 
-    # a shipped scenario, on whose frames it was measured how the detector finds lights, errs in their centres and
-    # layers, and sees false ones; in place of noise_px, the ranges, wrong_layer and color, as in a rendering
+    at_s: tuple[Interval, ...] = ()  # begin and end of each, since the start
+    count: Counts = (0, 0)  # number of further ones, at random times of a run
+    length_s: Lengths = (0.2, 2.0)  # duration of each of these
+
+
+class DetectionKnobs(KnobSection):
+    """Bare detections, made without rendering. Each draw of a path of draws is a run of its own."""
+
+    # name of a shipped scenario: detections are made as the detector was measured on its rendered frames, with misses,
+    # errors of centroid and layer, and false detections; noise_px, the ranges, wrong_layer and color are then not used
     detector: str = ""
     noise_px: NonNegativeFloat = 0.5
-    front_range_m: Lengths = (40.0, 40.0)  # from a light; beyond it the light is not seen; drawn for a run
+    front_range_m: Lengths = (40.0, 40.0)  # range beyond which front lights are not seen, drawn once a run
     rear_range_m: Lengths = (20.0, 20.0)
-    wrong_layer: Probability = 0.0  # of each spot's p_rear; spurious spots look like front lights
-    color: bool = True  # without it p_rear is unknown
-    drop: Probability = 0.0  # of each light, front or rear, in each frame
-    dead: Counts = (0, 0)  # lights, front or rear, that are dark through a run
-    # mean number of further spurious spots, Poisson and new in each frame
+    wrong_layer: Probability = 0.0  # that p_rear is wrong; of spurious ones, that it is not of front lights
+    color: bool = True  # False: p_rear is unknown
+    drop: Probability = 0.0  # that a light is missed, for each light in each frame
+    dead: Counts = (0, 0)  # number of lights that are dark through a run
+    # mean number of further spurious detections in each frame, Poisson distributed
     clutter: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
-    place: Literal["picture", "beside"] = "picture"  # of what is drawn anew: beside is the box of the array and 50 %
-    dock: bool = True  # whether it is in view at all
-    mirror: Literal["none", "only"] = "none"  # only: the array is seen in the water surface above it, and not itself
+    place: Literal["picture", "beside"] = "picture"  # of these; beside: within 1.5 times the box of the lights
+    dock: bool = True  # whether there is a dock
+    mirror: Literal["none", "only"] = "none"  # only: the mirror image in the water surface is seen, not the dock
     surface_m: Lengths = (1.0, 4.0)  # height of the water surface above the dock's origin
-    survey: bool = False  # lights stand off the station's positions by its survey_sigma
-    calibration: bool = False  # the lens is off the camera's by the station's calibration_sigma
+    survey: bool = False  # whether lights are displaced by errors of the station's survey_sigma
+    calibration: bool = False  # whether the lens has errors of the station's calibration_sigma
     black_outs: BlackOuts = BlackOuts()
     attitude: AttitudeSensor | None = None
 
 
-class Scenario(Section):
-    """Everything that a seed does not decide."""
+class Scenario(KnobSection):
+    """Everything that defines a simulation beside the seed, the station and the camera."""
 
     name: str = "approach"
     about: str = ""
-    station: str | None = None  # shipped station that it is made for, where that is not the paper's cage
+    station: str | None = None  # shipped station of the scenario; without one the cage of the paper
     path: Path3D = Path3D()
-    water: Water = Water()
+    water: WaterKnobs = WaterKnobs()
     daylight: Daylight = Daylight()
     lamps: Lamps = Lamps()
-    around: Around = Around()
+    around: Surroundings = Surroundings()
     matter: Matter = Matter()
-    lens: Lens = Lens()
+    lens: LensKnobs = LensKnobs()
     sensor: Sensor = Sensor()
     output: Output = Output()
-    stream: Stream = Stream()
+    stream: StreamFaults = StreamFaults()
     faults: Faults = Faults()
     detections: DetectionKnobs = DetectionKnobs()
-    config: dict[str, Any] = Field(
-        default_factory=dict
-    )  # settings of the method that the scenario needs, as in a configuration file
+    config: dict[str, Any] = Field(default_factory=dict)  # configuration of the localizer that the scenario needs
 
     @model_validator(mode="after")
-    def _mirrored_camera_can_be_turned(self) -> Self:
+    def _mirror_needs_draws(self) -> Self:
         if self.detections.mirror == "only" and self.path.kind != "draws":
-            raise ValueError("detections.mirror: wanted a path of draws, whose camera looks up at the surface")
+            raise ValueError("detections.mirror: only needs a path of draws, whose camera is turned up to the surface")
         return self
 
     @property
     def shows_dock(self) -> bool:
-        """Whether a spot can be a light of the dock."""
+        """Whether a detection can be a light of the dock."""
         return self.detections.dock and self.detections.mirror == "none"
 
 
@@ -183,8 +182,21 @@ def shipped_scenarios() -> list[str]:
     return sorted(Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".yaml"))
 
 
+def station_of(scenario: Scenario) -> Path:
+    """File of the shipped station that a scenario is made for: its `station`, or the cage of the paper.
+
+    Raises: InputError when no such station is shipped.
+    """
+    folder = Path(str(files("lumidock"))) / "stations"
+    path = folder / f"{scenario.station or _DEFAULT_STATION}.yaml"
+    if not path.is_file():
+        shipped = ", ".join(sorted(entry.stem for entry in folder.glob("*.yaml")))
+        raise InputError(f"{scenario.name}: station {scenario.station} is not shipped; there are {shipped}")
+    return path
+
+
 def load_scenario(name: str, settings: tuple[str, ...] = ()) -> Scenario:
-    """Read a scenario, shipped or a file, and apply `key.subkey=value` settings.
+    """Read a shipped scenario or a file, and apply settings of the form `key.subkey=value`.
 
     Raises: InputError, one line, for an unknown name, key or value.
     """
@@ -201,7 +213,7 @@ def load_scenario(name: str, settings: tuple[str, ...] = ()) -> Scenario:
 
 
 def _apply(content: dict[str, Any], setting: str) -> None:
-    """Put one `key.subkey=value` into nested content."""
+    """Change the value of one `key.subkey=value` in nested content."""
     key, equals, value = setting.partition("=")
     *parents, last = key.strip().split(".")
     for parent in parents:
@@ -219,7 +231,7 @@ def _apply(content: dict[str, Any], setting: str) -> None:
 def trajectory(scenario: Scenario, rng: np.random.Generator) -> tuple[np.ndarray, Array]:
     """Stamps `t_ns` (N,) and true poses `T_dock_cam` (N, 4, 4) of a scenario that has a path.
 
-    Raises: InputError for draws, which are no path.
+    Raises: InputError for a path of draws, which has no trajectory.
     """
     path = scenario.path
     if path.kind == "draws":
@@ -254,7 +266,7 @@ def poses(R_dock_cam: Array, t_dock_cam: Array) -> Array:
 
 
 def draw_stamps(path: Path3D) -> np.ndarray:
-    """Stamps `t_ns` (count, hold) of draws, far enough apart that no history reaches from one to the next."""
+    """Stamps `t_ns` (count, hold) of draws, so far apart that no track survives from one draw to the next."""
     start, step = np.arange(path.count) * _BETWEEN_DRAWS_S, np.arange(path.hold) * path.frame_interval_s
     return np.round((start[:, None] + step) * 1e9).astype(np.int64)
 
@@ -276,7 +288,7 @@ def _rectangle(path: Path3D, speed_m_s: float) -> Array:
 
 
 def _wander(t_s: Array, count: int, period_s: tuple[float, float], rng: np.random.Generator) -> Array:
-    """Smooth random signals (N, count), each a sum of three sines that never leaves [-1, 1]."""
+    """Smooth random signals (N, count) within [-1, 1], each a sum of three sines."""
     periods = rng.uniform(*period_s, (3, count))
     phases = rng.uniform(0.0, 2 * np.pi, (3, count))
     shares = rng.dirichlet(np.full(3, 3.0), count).T
@@ -284,7 +296,7 @@ def _wander(t_s: Array, count: int, period_s: tuple[float, float], rng: np.rando
 
 
 def spurious_paths(scenario: Scenario, t_ns: np.ndarray, size: tuple[int, int], rng: np.random.Generator) -> Array:
-    """Pixels (N, S, 2) of the spurious lights, wandering over an image of `size` (width, height)."""
+    """Pixels (N, S, 2) of spurious lights that wander over an image of `size` (width, height)."""
     count = int(rng.integers(*scenario.faults.spurious, endpoint=True))
     steps = _wander(t_ns * 1e-9, 2 * count, (3.0, 12.0), rng).reshape(len(t_ns), count, 2)
     return np.asarray((0.5 + 0.49 * np.clip(1.6 * steps, -1.0, 1.0)) * np.array(size))

@@ -1,4 +1,4 @@
-"""What happens when: for every frame of a scenario the pose, the exposure, and what is dark or spurious in it."""
+"""For every frame of a scenario: pose, exposure, and which lights are dark or spurious."""
 
 from __future__ import annotations
 
@@ -12,23 +12,25 @@ from lumidock.datatypes import Array, Indices
 from lumidock.geometry import se3_exp, se3_inverse, se3_log
 from lumidock.sim.course import Course, course_of
 from lumidock.sim.detections import RunDraws, dark_lights, failed, in_view, run_draws
-from lumidock.sim.frames import Moment, Studio
-from lumidock.sim.knobs import AutoExposure, Surface
+from lumidock.sim.draws import Draw
+from lumidock.sim.frames import FrameConditions, FrameRenderer
+from lumidock.sim.knobs import AutoExposure, WaterSurface
 from lumidock.sim.lens import Lens
 from lumidock.sim.scenario import Scenario, spurious_paths
 from lumidock.sim.sensor import LEVELS, electrons_per_level
 from lumidock.sim.water import green_index
 from lumidock.station import Station
 
-_METER_BINS = np.logspace(-2.0, 6.0, 161)  # electrons per ms
-_BRIGHT_SHARE = 1e-3
+_METER_BINS = np.logspace(-2.0, 6.0, 161)  # edges of the bins of exposure metering, electrons per ms
+_BRIGHT_SHARE = 1e-3  # of the pixels may exceed the level `AutoExposure.bright`
 
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """A scenario with everything drawn that lasts; frames are told apart by their number.
+    """A scenario with all draws that hold for longer than one frame; it gives the conditions of each frame by number.
 
-    `strays` (N, W, 2) px are the spurious lights that wander through the run, `exposure_s` (N,) those of the frames.
+    `drawn` holds for a run; `spurious_uv` (N, W, 2) px are spurious lights that wander through the run; `exposure_s`
+    (N,) are the exposures of the frames.
     """
 
     scenario: Scenario
@@ -36,26 +38,26 @@ class Schedule:
     camera: Camera
     seed: int
     course: Course
-    world: RunDraws
+    drawn: RunDraws
     spurious_uv: Array
     exposure_s: Array
-    _studio: dict[int, Studio] = field(default_factory=dict, init=False)
+    _renderer: dict[int, FrameRenderer] = field(default_factory=dict, init=False)
 
     def __len__(self) -> int:
         return len(self.course.t_ns)
 
-    def studio(self, number: int) -> Studio:
-        """What draws the frame: the lens as it really is in its run. That of the last run is kept."""
+    def renderer(self, number: int) -> FrameRenderer:
+        """The renderer of a frame, with the true lens of its run; the renderer of the last run is kept."""
         run = int(self.course.run[number])
-        if run not in self._studio:
-            focal, center = float(self.world.focal[run]) - self.scenario.lens.focal_error, self.world.center_px[run]
+        if run not in self._renderer:
+            focal, center = float(self.drawn.focal[run]) - self.scenario.lens.focal_error, self.drawn.center_px[run]
             lens = Lens.of(self.scenario.lens, self.camera, green_index(self.scenario.water), focal, center)
-            self._studio.clear()
-            self._studio[run] = Studio(self.scenario, self.station, lens, (self.seed, run))
-        return self._studio[run]
+            self._renderer.clear()
+            self._renderer[run] = FrameRenderer(self.scenario, self.station, lens, (self.seed, run))
+        return self._renderer[run]
 
-    def moment(self, number: int) -> Moment:
-        """What decides the frame."""
+    def conditions(self, number: int) -> FrameConditions:
+        """The conditions of a frame."""
         scenario, course = self.scenario, self.course
         run, t_s = int(course.run[number]), float(course.t_ns[number]) * 1e-9
         exposure_s = float(self.exposure_s[number])
@@ -63,14 +65,14 @@ class Schedule:
         only_mirror = scenario.detections.mirror == "only"
         surface = scenario.around.surface
         if only_mirror:
-            surface = (surface or Surface()).model_copy(update={"height_m": float(course.surface_m[run])})
-        share = np.random.default_rng([*draws, 10]).uniform(*scenario.lamps.fouling, len(self.station))
-        return Moment(
+            surface = (surface or WaterSurface()).model_copy(update={"height_m": float(course.surface_m[run])})
+        share = np.random.default_rng([*draws, Draw.FOULING]).uniform(*scenario.lamps.fouling, len(self.station))
+        return FrameConditions(
             t_s=t_s,
             exposure_s=exposure_s,
             T_dock_cam=course.T_dock_cam[number],
             T_cam_later=self._later(number, exposure_s),
-            p_dock=self.world.p_dock[run],
+            p_dock=self.drawn.p_dock[run],
             transmission=share,
             dark=self._dark(number, t_s),
             spurious=self._spurious(number),
@@ -80,7 +82,7 @@ class Schedule:
         )
 
     def _later(self, number: int, exposure_s: float) -> Array:
-        """T_cam_later at the end of the exposure, by the speed toward the next frame, or from the one before."""
+        """T_cam_later (4, 4), the motion during the exposure, from that between this frame and a neighbour."""
         T, run = self.course.T_dock_cam, self.course.run
         other = number + 1 if number + 1 < len(T) and run[number + 1] == run[number] else number - 1
         if other < 0 or run[other] != run[number]:
@@ -89,26 +91,25 @@ class Schedule:
         return np.asarray(se3_exp(se3_log(se3_inverse(T[number]) @ T[other]) * (exposure_s / lapse_s)))
 
     def _dark(self, number: int, t_s: float) -> Indices:
-        """Indices of the lights that do not shine."""
-        scenario, station, world = self.scenario, self.station, self.world
-        if world.black[number] or not scenario.detections.dock:
+        """Indices of the lights that are dark."""
+        scenario, station, drawn = self.scenario, self.station, self.drawn
+        if drawn.black[number] or not scenario.detections.dock:
             return np.arange(len(station))
         run = int(self.course.run[number])
-        rng = np.random.default_rng([self.seed, 3, int(self.course.missing_from[number])])
+        rng = np.random.default_rng([self.seed, Draw.MISSING_LIGHTS, int(self.course.missing_from[number])])
         front = station.lights_of(station.layers_front_to_rear()[0])
         lit = in_view(station, self.camera, self.course.T_dock_cam[number])[1]
-        off = world.dead[run] | failed(scenario, station, np.array([t_s]))[0]
+        off = drawn.dead[run] | failed(scenario, station, np.array([t_s]))[0]
         off[dark_lights(scenario, front[lit[front]], rng)] = True
-        return np.flatnonzero(
-            off | (np.random.default_rng([self.seed, 7, number]).random(len(off)) < scenario.detections.drop)
-        )
+        dropped = np.random.default_rng([self.seed, Draw.DROPPED_LIGHTS, number]).random(len(off))
+        return np.flatnonzero(off | (dropped < scenario.detections.drop))
 
     def _spurious(self, number: int) -> Array:
-        """Pixels (S, 2) of the spurious lights: those that wander, and those drawn anew."""
+        """Pixels (S, 2) of the spurious lights: those that wander, and those of this frame alone."""
         scenario, camera = self.scenario, self.camera
-        if self.world.black[number]:
+        if self.drawn.black[number]:
             return np.empty((0, 2))
-        rng = np.random.default_rng([self.seed, 8, number])
+        rng = np.random.default_rng([self.seed, Draw.SPURIOUS_LIGHTS, number])
         new = int(rng.poisson(scenario.detections.clutter))
         if scenario.path.kind == "draws":
             new += int(rng.integers(*scenario.faults.spurious, endpoint=True))
@@ -121,46 +122,50 @@ class Schedule:
 
 
 def schedule_of(scenario: Scenario, station: Station, camera: Camera, seed: int) -> Schedule:
-    """Draw what a scenario leaves to the seed; the exposures are those of the sensor's knob."""
-    course = course_of(scenario, station, camera, np.random.default_rng([seed, 0]))
-    world = run_draws(scenario, station, course, np.random.default_rng([seed, 4]))
+    """Draw the schedule of a scenario; automatic exposure is not yet applied."""
+    course = course_of(scenario, station, camera, np.random.default_rng([seed, Draw.COURSE]))
+    drawn = run_draws(scenario, station, course, np.random.default_rng([seed, Draw.RUN]))
     wander: Array = np.empty((len(course.t_ns), 0, 2))
     if scenario.path.kind != "draws":
         size = (camera.width, camera.height)
-        wander = spurious_paths(scenario, course.t_ns, size, np.random.default_rng([seed, 2]))
+        wander = spurious_paths(scenario, course.t_ns, size, np.random.default_rng([seed, Draw.WANDERING_LIGHTS]))
     exposure_s = np.full(len(course.t_ns), scenario.sensor.exposure_ms * 1e-3)
-    return Schedule(scenario, station, camera, seed, course, world, wander, exposure_s)
+    return Schedule(
+        scenario, station, camera, seed, course=course, drawn=drawn, spurious_uv=wander, exposure_s=exposure_s
+    )
 
 
-def exposed(plan: Schedule) -> Schedule:
-    """The same with the exposures of its control loop, if the scenario has one."""
-    control = plan.scenario.sensor.auto_exposure
+def with_auto_exposure(schedule: Schedule) -> Schedule:
+    """The same schedule with the exposures that automatic exposure sets, if the scenario has it."""
+    control = schedule.scenario.sensor.auto_exposure
     if control is None:
-        return plan
-    return replace(plan, exposure_s=controlled(plan, control, [metered(plan, k) for k in range(len(plan))]))
+        return schedule
+    return replace(
+        schedule, exposure_s=controlled(schedule, control, [metered(schedule, k) for k in range(len(schedule))])
+    )
 
 
-def metered(plan: Schedule, number: int) -> Indices:
-    """Histogram (160,) of the light in a frame, electrons per ms; each cell of the mosaic counts with its mean."""
-    moment = plan.moment(number)
-    electrons = plan.studio(number).shoot(moment).electrons
-    step = 2 if plan.scenario.output.color else 1
+def metered(schedule: Schedule, number: int) -> Indices:
+    """Histogram (160,) of the light in a frame, in electrons per ms; each 2 x 2 cell of a mosaic counts once."""
+    conditions = schedule.conditions(number)
+    electrons = schedule.renderer(number).expect(conditions).electrons
+    step = 2 if schedule.scenario.output.color else 1
     cells = cv2.resize(electrons, None, fx=1.0 / step, fy=1.0 / step, interpolation=cv2.INTER_AREA)
-    light = cells / (1e3 * moment.exposure_s)
+    light = cells / (1e3 * conditions.exposure_s)
     counts = np.histogram(np.clip(light, _METER_BINS[0], 0.999 * _METER_BINS[-1]), _METER_BINS)[0]
     return np.asarray(counts, np.int64)
 
 
-def controlled(plan: Schedule, knobs: AutoExposure, light: list[Indices]) -> Array:
-    """Exposures (N,) s of the control loop, from each frame's histogram; every frame answers to the one before."""
-    sensor, middle = plan.scenario.sensor, np.sqrt(_METER_BINS[1:] * _METER_BINS[:-1])
+def controlled(schedule: Schedule, knobs: AutoExposure, light: list[Indices]) -> Array:
+    """Exposures (N,) s set by the control loop; each depends on the histograms `light` of the frames before it."""
+    sensor, middle = schedule.scenario.sensor, np.sqrt(_METER_BINS[1:] * _METER_BINS[:-1])
     full_e = LEVELS * electrons_per_level(sensor)
     exposure_ms = np.empty(len(light))
     now = float(np.clip(sensor.exposure_ms, knobs.min_ms, knobs.max_ms))
     for number, counts in enumerate(light):
         exposure_ms[number] = now
         level = np.minimum(middle * now / full_e, 1.0) ** (1.0 / sensor.gamma)
-        share = np.cumsum(counts[::-1])[::-1] / counts.sum()  # of the pixels that are at least as bright
+        share = np.cumsum(counts[::-1])[::-1] / counts.sum()  # share of pixels that are at least as bright
         bright = float(level[np.flatnonzero(share >= _BRIGHT_SHARE)[-1]])
         wanted = min(np.log(knobs.mean / float((level * counts).sum() / counts.sum())), np.log(knobs.bright / bright))
         now = float(np.clip(now * np.exp(knobs.gain * sensor.gamma * wanted), knobs.min_ms, knobs.max_ms))

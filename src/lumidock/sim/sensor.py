@@ -1,4 +1,4 @@
-"""The sensor: electrons on the mosaic -> 12-bit levels -> what a camera hands out."""
+"""The image sensor: from expected electrons per pixel to noisy 12-bit levels and the picture that a camera delivers."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from lumidock.datatypes import Array, Indices
 from lumidock.sim.knobs import Output, Sensor
 
 LEVELS = 4095  # 12 bit
-_ROWS = 16
-_MONO16_SHIFT = 4  # 12 bit in the upper part of 16
+_ROWS = 16  # read out at once, so that they stay in the cache
+_TO_16_BIT = 4  # bits by which the 12-bit levels are shifted up
 _TO_BGR = {
     "rggb": cv2.COLOR_BayerRGGB2BGR,
     "bggr": cv2.COLOR_BayerBGGR2BGR,
@@ -21,22 +21,23 @@ _TO_BGR = {
 
 
 def electrons_per_level(sensor: Sensor) -> float:
-    """Electrons behind one level of 12 bit."""
+    """Electrons per 12-bit level at the gain of the knobs."""
     return float(sensor.full_well_e / LEVELS / 10.0 ** (sensor.gain_db / 20.0))
 
 
 def saturation_e(sensor: Sensor) -> float:
-    """Electrons beyond which a pixel tells nothing more: the full well, or the end of the scale at this gain."""
+    """Electrons at which a pixel saturates: its full well, or full scale at the gain of the knobs."""
     return min(sensor.full_well_e, LEVELS * electrons_per_level(sensor))
 
 
 def read_out(electrons: Array, sensor: Sensor, rng: np.random.Generator) -> NDArray[np.uint16]:
-    """12-bit levels (H, W) of expected electrons (H, W).
+    """12-bit levels (H, W) of a sensor whose pixels expect `electrons` (H, W).
 
-    Shot noise (Gaussian limit), full well, read noise, gain, rounding. Source: EMVA 1288, release 4, camera model.
+    Adds shot noise (as a Gaussian) and read noise, clips at the full well, applies the gain and rounds.
+    Source: EMVA 1288, release 4, camera model.
     """
     raw, block = np.empty(electrons.shape, np.uint16), np.empty((2, _ROWS, electrons.shape[1]), np.float32)
-    for row in range(0, len(raw), _ROWS):  # a few rows at a time stay in the cache
+    for row in range(0, len(raw), _ROWS):
         light = electrons[row : row + _ROWS]
         levels, sigma = block[:, : len(light)]
         rng.standard_normal(dtype=np.float32, out=levels)
@@ -50,27 +51,27 @@ def read_out(electrons: Array, sensor: Sensor, rng: np.random.Generator) -> NDAr
 
 
 def picture(raw: NDArray[np.uint16], sensor: Sensor, output: Output) -> np.ndarray:
-    """The picture a camera gives: (H, W, 3) bgr8, or (H, W) mono8, mono16, bayer8, bayer16.
+    """The picture that the camera delivers from raw levels (H, W): (H, W, 3) bgr8, or (H, W) in the other formats.
 
-    8-bit pictures have the gamma of the knob, except raw mosaics; 16-bit ones are linear.
+    8-bit pictures are gamma-encoded except raw mosaics (bayer8); 16-bit pictures are linear.
     """
     if output.pixels == "bayer16":
-        return np.left_shift(raw, _MONO16_SHIFT)
+        return np.left_shift(raw, _TO_16_BIT)
     if output.pixels == "bayer8":
-        return np.right_shift(raw, _MONO16_SHIFT).astype(np.uint8)
+        return np.right_shift(raw, _TO_16_BIT).astype(np.uint8)
     developed = cv2.demosaicing(raw, _TO_BGR[output.pattern]) if output.color else raw
-    if output.color and output.white_balance != (1.0, 1.0, 1.0):
-        gains = np.array(output.white_balance, np.float32)
+    if output.color and output.channel_gains != (1.0, 1.0, 1.0):
+        gains = np.array(output.channel_gains, np.float32)
         developed = np.minimum(np.rint(developed * gains), LEVELS).astype(np.uint16)
     if output.color and output.pixels != "bgr8":
         developed = cv2.cvtColor(developed, cv2.COLOR_BGR2GRAY)
     if output.pixels == "mono16":
-        return np.left_shift(np.asarray(developed, np.uint16), _MONO16_SHIFT)
+        return np.left_shift(np.asarray(developed, np.uint16), _TO_16_BIT)
     return np.asarray(_gamma_table(sensor.gamma)[developed])
 
 
 def hot_pixels(sensor: Sensor, shape: tuple[int, int], rng: np.random.Generator) -> tuple[Indices, Array]:
-    """Rows and columns (2, K) of pixels with a large dark current, and that (K,) in electrons a second."""
+    """Rows and columns (2, K) of K pixels with a large dark current, and these currents (K,) in electrons a second."""
     at = rng.integers(0, np.array(shape)[:, None], (2, sensor.hot_pixels))
     low, high = np.log(sensor.hot_e_s).tolist()
     return at, np.exp(rng.uniform(low, high, sensor.hot_pixels))

@@ -1,4 +1,4 @@
-"""Writing of simulated sequences: rendered frames or bare detections, with their truth."""
+"""Writes simulated sequence folders: rendered frames or bare detections, with their truth."""
 
 from __future__ import annotations
 
@@ -23,27 +23,29 @@ from lumidock.datatypes import Array, Indices
 from lumidock.errors import InputError, LumidockError
 from lumidock.geometry import quat_xyzw_from_rotation
 from lumidock.sim.detections import SimulatedFrame, simulated_frames
-from lumidock.sim.frames import Moment, Shot, Studio
+from lumidock.sim.draws import Draw
+from lumidock.sim.frames import ExpectedFrame, FrameConditions, FrameRenderer
 from lumidock.sim.knobs import Output
 from lumidock.sim.lens import Lens, calibrated_in_water
 from lumidock.sim.optics import Emitters
 from lumidock.sim.scenario import Scenario
-from lumidock.sim.schedule import Schedule, controlled, exposed, metered, schedule_of
+from lumidock.sim.schedule import Schedule, controlled, metered, schedule_of, with_auto_exposure
 from lumidock.sim.stream import OVER_EXPOSED, Row, rows_of
 from lumidock.sim.video import as_video, seen_by_field, woven
 from lumidock.sim.water import green_index
 from lumidock.station import Station
 
+# matched-filter SNR over which a light is visible, and over which other sources are listed in spurious_truth.csv
 _VISIBLE_SNR, _NOTED_SNR = 8.0, 4.0
 _VIDEO_CODEC = "mp4v"
-_PNG_OPTIONS = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-Progress = Callable[[int, int], None]
+_PNG_OPTIONS = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # fast
+Progress = Callable[[int, int], None]  # called with the number of finished steps and of all steps
 Line = list[object]
 
 
 @dataclass(frozen=True, slots=True)
 class _Written:
-    """Truth of one frame: lines for lights_truth.csv and spurious_truth.csv, without the frame's name."""
+    """Truth of one frame: lines of lights_truth.csv and spurious_truth.csv, without the name of the frame."""
 
     lights: list[Line]
     spurious: list[Line]
@@ -58,13 +60,13 @@ def render_frame(
     dark: Indices,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, Emitters, Array]:
-    """One picture of a still camera, its lamps and their matched-filter SNR (M,).
+    """One picture of a still camera, the station's M lamps as emitters, and their matched-filter SNR (M,).
 
-    `strays` (S, 2) px are lamps that belong to no dock, `dark` the lights that are out in this frame.
+    `spurious` (S, 2) px are images of lamps that do not belong to the dock, `dark` the indices of lights that are off.
     """
     lens = Lens.of(scenario.lens, camera, green_index(scenario.water))
-    studio, m = Studio(scenario, station, lens), len(station)
-    moment = Moment(
+    renderer, m = FrameRenderer(scenario, station, lens), len(station)
+    conditions = FrameConditions(
         t_s=0.0,
         exposure_s=scenario.sensor.exposure_ms * 1e-3,
         T_dock_cam=T_dock_cam,
@@ -75,15 +77,15 @@ def render_frame(
         spurious=spurious,
         surface=scenario.around.surface,
     )
-    shot = studio.shoot(moment)
-    own = Emitters(*(getattr(shot.seen, name)[:m] for name in Emitters.__slots__))
-    return studio.develop(shot, rng), own, shot.snr[:m]
+    expected = renderer.expect(conditions)
+    own = Emitters(*(getattr(expected.emitters, name)[:m] for name in Emitters.__slots__))
+    return renderer.picture_of(expected, rng), own, expected.snr[:m]
 
 
 def require_possible(scenario: Scenario, *, detections: bool = False, video: bool = False) -> None:
-    """Raises: InputError where a scenario has no bare detections, or no video can hold its pictures."""
+    """Raises: InputError where bare detections cannot be made of a scenario, or a video cannot hold its pictures."""
     if detections and scenario.lens.port is not None:
-        raise InputError(f"{scenario.name}: a flat port is only rendered, it has no bare detections")
+        raise InputError(f"{scenario.name}: has a flat port, which bare detections do not model; render it")
     if video and scenario.output.pixels not in ("bgr8", "mono8"):
         raise InputError(f"output.pixels: a video holds bgr8 or mono8, not {scenario.output.pixels}")
 
@@ -99,57 +101,57 @@ def write_rendered(
     workers: int | None = None,
     progress: Progress = lambda _done, _total: None,
 ) -> int:
-    """Render a scenario into the sequence folder `out`; the same bytes whatever `workers`. Returns the number of rows.
+    """Render a scenario into the sequence folder `out`; `workers` does not change the bytes. Returns the row count.
 
     With `video` the pictures go into video.mp4 instead of frames/.
     """
     require_possible(scenario, video=video)
-    plan, rows = _planned(scenario, station, camera, seed)
+    schedule, rows = _scheduled(scenario, station, camera, seed)
     (out / "frames").mkdir(parents=True, exist_ok=True)
     control = scenario.sensor.auto_exposure
-    once = _once(rows)
-    total = len(once) + (len(plan) if control else 0)
+    unique = _unique(rows)
+    total = len(unique) + (len(schedule) if control else 0)
     with _mapping(workers or os.cpu_count() or 1) as mapping:
         if control:
-            light = _counted(mapping(partial(metered, plan), range(len(plan))), progress, 0, total)
-            plan = replace(plan, exposure_s=controlled(plan, control, light))
-        job = partial(_write_frame, plan, out)
-        written = _counted(mapping(job, once), progress, total - len(once), total)
-    _write_truth(plan, rows, dict(zip(once, written, strict=True)), out)
+            light = _counted(mapping(partial(metered, schedule), range(len(schedule))), progress, 0, total)
+            schedule = replace(schedule, exposure_s=controlled(schedule, control, light))
+        job = partial(_write_frame, schedule, out)
+        written = _counted(mapping(job, unique), progress, total - len(unique), total)
+    _write_truth(schedule, rows, dict(zip(unique, written, strict=True)), out)
     if video:
         _into_video(rows, out, scenario)
     return len(rows)
 
 
 def rendered(scenario: Scenario, station: Station, camera: Camera, seed: int, out: Path) -> list[tuple[Row, bytes]]:
-    """Render in this process and in memory: every row of timestamps.csv, and the content of its picture's file.
+    """Render in this process and in memory; returns every row of timestamps.csv and the content of its picture file.
 
-    What `write_rendered` writes beside the pictures is written into the folder `out`.
+    All other files of the sequence are written into the folder `out`.
     """
-    plan, rows = _planned(scenario, station, camera, seed)
-    plan, once = exposed(plan), _once(rows)
-    pictures, truths = zip(*(_taken(plan, row) for row in once), strict=True)
-    _write_truth(plan, rows, dict(zip(once, truths, strict=True)), out)
-    picture = {row.number: content for row, content in zip(once, pictures, strict=True)}
+    schedule, rows = _scheduled(scenario, station, camera, seed)
+    schedule, unique = with_auto_exposure(schedule), _unique(rows)
+    pictures, truths = zip(*(_rendered_row(schedule, row) for row in unique), strict=True)
+    _write_truth(schedule, rows, dict(zip(unique, truths, strict=True)), out)
+    picture = {row.number: content for row, content in zip(unique, pictures, strict=True)}
     return [(row, picture[row.number]) for row in rows]
 
 
-def _once(rows: list[Row]) -> list[Row]:
-    """The rows with a picture of their own: a doubled row has one file."""
+def _unique(rows: list[Row]) -> list[Row]:
+    """The rows without duplicates, as a duplicated row has one file."""
     return list({row.number: row for row in reversed(rows)}.values())[::-1]
 
 
-def _planned(scenario: Scenario, station: Station, camera: Camera, seed: int) -> tuple[Schedule, list[Row]]:
-    """What is rendered, and the rows of timestamps.csv. Raises: InputError when there would be none."""
-    plan = schedule_of(scenario, station, camera, seed)
-    rows = rows_of(scenario.stream, plan.course.t_ns, np.random.default_rng([seed, 6]))
+def _scheduled(scenario: Scenario, station: Station, camera: Camera, seed: int) -> tuple[Schedule, list[Row]]:
+    """The schedule and the rows of timestamps.csv. Raises: InputError when there are no rows."""
+    schedule = schedule_of(scenario, station, camera, seed)
+    rows = rows_of(scenario.stream, schedule.course.t_ns, np.random.default_rng([seed, Draw.STREAM_FAULTS]))
     if not rows:
         raise InputError(f"{scenario.name}: every frame is dropped")
-    return plan, rows
+    return schedule, rows
 
 
 def _counted(results: Iterable[Any], progress: Progress, done: int, total: int) -> list[Any]:
-    """All results, with `progress` told of each."""
+    """Collect all results and report the progress after each."""
     collected = []
     for result in results:
         collected.append(result)
@@ -159,7 +161,7 @@ def _counted(results: Iterable[Any], progress: Progress, done: int, total: int) 
 
 @contextmanager
 def _mapping(workers: int) -> Iterator[Callable[..., Iterable[Any]]]:
-    """`map`, in this process or over worker processes."""
+    """A function like `map` that runs in this process or in worker processes."""
     if workers == 1:
         yield map
         return
@@ -172,7 +174,7 @@ def _mapping(workers: int) -> Iterator[Callable[..., Iterable[Any]]]:
 
 
 def _mapped(pool: ProcessPoolExecutor, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
-    """`map` over workers that never hear of Ctrl-C, not even while they start: it is their parent that ends them."""
+    """`map` over worker processes that block SIGINT from their start on, so that only their parent handles Ctrl-C."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         return pool.map(function, items, chunksize=4)
@@ -180,48 +182,50 @@ def _mapped(pool: ProcessPoolExecutor, function: Callable[[Any], Any], items: It
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _write_frame(plan: Schedule, out: Path, row: Row) -> _Written:
-    """Render the picture of one row to its file, and say what is in it."""
-    picture, truth = _taken(plan, row)
-    (out / "frames" / file_of(row, plan.scenario)).write_bytes(picture)
+def _write_frame(schedule: Schedule, out: Path, row: Row) -> _Written:
+    """Render the picture of one row into its file; returns its truth."""
+    picture, truth = _rendered_row(schedule, row)
+    (out / "frames" / file_of(row, schedule.scenario)).write_bytes(picture)
     return truth
 
 
-def _taken(plan: Schedule, row: Row) -> tuple[bytes, _Written]:
-    """The file with the picture of one row, and what is in it."""
-    studio, moment = plan.studio(row.shows), plan.moment(row.shows)
+def _rendered_row(schedule: Schedule, row: Row) -> tuple[bytes, _Written]:
+    """The content of the picture file of one row, and its truth."""
+    renderer, conditions = schedule.renderer(row.shows), schedule.conditions(row.shows)
     if row.fault == "over_exposed":
-        moment = replace(moment, exposure_s=moment.exposure_s * OVER_EXPOSED)
-    rng = np.random.Generator(np.random.SFC64([plan.seed, 9, row.shows]))
-    shot, image = _exposed(studio, moment, rng)
-    image = as_video(image, plan.scenario.output)
+        conditions = replace(conditions, exposure_s=conditions.exposure_s * OVER_EXPOSED)
+    rng = np.random.Generator(np.random.SFC64([schedule.seed, Draw.SENSOR_NOISE, row.shows]))
+    expected, image = _expose(renderer, conditions, rng)
+    image = as_video(image, schedule.scenario.output)
     if row.fault in ("black", "white"):
         image[...] = 0 if row.fault == "black" else np.iinfo(image.dtype).max
-    content = encoded(image, plan.scenario.output)
+    content = encoded(image, schedule.scenario.output)
     if row.fault == "half_written":
         content = content[: len(content) // 2]
     lost = row.fault in ("black", "white", "half_written")
-    return content, _truth_of(studio, shot, lost)
+    return content, _truth_of(renderer, expected, lost)
 
 
-def _exposed(studio: Studio, moment: Moment, rng: np.random.Generator) -> tuple[Shot, np.ndarray]:
-    """The shot of one frame and its picture; of two fields the places of the lamps are those in the middle of them."""
-    if studio.scenario.output.fields != "woven":
-        shot = studio.shoot(moment)
-        return shot, studio.develop(shot, rng)
-    half_s, m = 0.5 * studio.scenario.output.field_s, len(studio.station)
-    first = studio.shoot(moment.shifted(-half_s))
-    even = studio.develop(first, rng)
+def _expose(
+    renderer: FrameRenderer, conditions: FrameConditions, rng: np.random.Generator
+) -> tuple[ExpectedFrame, np.ndarray]:
+    """One frame and its picture. In a frame of two fields the true pixels of lamps are means over both fields."""
+    if renderer.scenario.output.fields != "woven":
+        expected = renderer.expect(conditions)
+        return expected, renderer.picture_of(expected, rng)
+    half_s, m = 0.5 * renderer.scenario.output.field_s, len(renderer.station)
+    first = renderer.expect(conditions.shifted(-half_s))
+    even = renderer.picture_of(first, rng)
     electrons = first.electrons.copy()
-    second = studio.shoot(moment.shifted(half_s))
-    uv = first.seen.uv.copy()
-    uv[:m] = 0.5 * (first.seen.uv[:m] + second.seen.uv[:m])
-    shot = replace(first, electrons=electrons, seen=replace(first.seen, uv=uv))
-    return shot, woven(even, studio.develop(second, rng))
+    second = renderer.expect(conditions.shifted(half_s))
+    uv = first.emitters.uv.copy()
+    uv[:m] = 0.5 * (first.emitters.uv[:m] + second.emitters.uv[:m])
+    expected = replace(first, electrons=electrons, emitters=replace(first.emitters, uv=uv))
+    return expected, woven(even, renderer.picture_of(second, rng))
 
 
 def encoded(image: np.ndarray, output: Output) -> bytes:
-    """The content of the file of a picture (H, W[, 3]). Raises: LumidockError when it cannot be encoded."""
+    """Content of the file for a picture (H, W[, 3]). Raises: LumidockError when it cannot be encoded."""
     options = [cv2.IMWRITE_JPEG_QUALITY, output.quality] if output.file == "jpg" else _PNG_OPTIONS
     done, content = cv2.imencode(f".{output.file}", image, options)
     if not done:
@@ -230,42 +234,45 @@ def encoded(image: np.ndarray, output: Output) -> bytes:
 
 
 def file_of(row: Row, scenario: Scenario) -> str:
-    """Name of the row's picture."""
+    """Name of the picture file of a row."""
     return f"{row.name}.{scenario.output.file}"
 
 
-def _truth_of(studio: Studio, shot: Shot, lost: bool) -> _Written:
-    """What truth says of one picture; in one that is `lost` nothing is visible."""
-    seen, m = shot.seen, len(studio.station)
-    rows = np.array([1.0, 0.5 if studio.scenario.output.fields == "single" else 1.0])  # of what is written
-    uv = seen.uv * rows
-    snr = np.zeros(len(seen)) if lost else shot.snr
+def _truth_of(renderer: FrameRenderer, expected: ExpectedFrame, lost: bool) -> _Written:
+    """Truth of one picture; in a picture that is `lost` no light is visible."""
+    emitters, m = expected.emitters, len(renderer.station)
+    single_field = renderer.scenario.output.fields == "single"
+    scale = np.array([1.0, 0.5 if single_field else 1.0])  # of u and v in the picture as written
+    uv = emitters.uv * scale
+    snr = np.zeros(len(emitters)) if lost else expected.snr
     lights: list[Line] = [
         [light, f"{u:.4f}", f"{v:.4f}", int(s > _VISIBLE_SNR), f"{s:.2f}"]
-        for light, (u, v), s in zip(studio.station.ids, uv[:m], snr[:m], strict=True)
+        for light, (u, v), s in zip(renderer.station.ids, uv[:m], snr[:m], strict=True)
         if np.isfinite([u, v]).all()
     ]
-    noted = (snr > _NOTED_SNR) | (seen.kind == "injected")
+    noted = (snr > _NOTED_SNR) | (emitters.kind == "injected")
     noted[:m] = False
-    spurious: list[Line] = [[str(seen.kind[i]), f"{uv[i, 0]:.4f}", f"{uv[i, 1]:.4f}"] for i in np.flatnonzero(noted)]
+    spurious: list[Line] = [
+        [str(emitters.kind[i]), f"{uv[i, 0]:.4f}", f"{uv[i, 1]:.4f}"] for i in np.flatnonzero(noted)
+    ]
     shown = slice(0) if lost else slice(None)
-    for kind, places in (("reflection", shot.reflections), ("hot_pixel", studio.hot_at[::-1].T)):
-        spurious += [[kind, f"{u:.4f}", f"{v:.4f}"] for u, v in places[shown] * rows]
+    for kind, places in (("reflection", expected.reflections), ("hot_pixel", renderer.hot_at[::-1].T)):
+        spurious += [[kind, f"{u:.4f}", f"{v:.4f}"] for u, v in places[shown] * scale]
     return _Written(lights, spurious)
 
 
-def _write_truth(plan: Schedule, rows: list[Row], written: dict[Row, _Written], out: Path) -> None:
-    """Calibration, stamps and truth, a row for each frame of the sequence."""
-    scenario = plan.scenario
-    lens = plan.studio(0).lens
-    written_camera = seen_by_field(calibrated_in_water(lens, plan.camera), scenario.output)
+def _write_truth(schedule: Schedule, rows: list[Row], written: dict[Row, _Written], out: Path) -> None:
+    """Write camera.yaml, timestamps.csv and the tables of truth."""
+    scenario = schedule.scenario
+    lens = schedule.renderer(0).lens
+    written_camera = seen_by_field(calibrated_in_water(lens, schedule.camera), scenario.output)
     save_camera(written_camera, out / "camera.yaml")
     raw = scenario.output.pixels.startswith("bayer")
     columns = ("frame", "file", "t_ns", *(("encoding",) if raw else ()))
     encoding = [f"bayer_{scenario.output.pattern}{scenario.output.pixels.removeprefix('bayer')}"] if raw else []
     _write_csv(out / "timestamps.csv", columns, ([r.name, file_of(r, scenario), r.t_ns, *encoding] for r in rows))
     names = [row.name for row in written]
-    poses = plan.course.T_dock_cam[[row.number for row in written]]
+    poses = schedule.course.T_dock_cam[[row.number for row in written]]
     _write_poses(out, names, [row.t_ns for row in written], poses)
     _write_lights_truth(out, names, [truth.lights for truth in written.values()])
     _write_spurious(out, names, [truth.spurious for truth in written.values()])
@@ -274,7 +281,7 @@ def _write_truth(plan: Schedule, rows: list[Row], written: dict[Row, _Written], 
 
 
 def _into_video(rows: list[Row], out: Path, scenario: Scenario) -> None:
-    """Make a video of the pictures, which are then gone; what cannot be decoded is left out as a recorder would."""
+    """Move the pictures into video.mp4; files that cannot be decoded are left out."""
     video, writer = out / "video.mp4", None
     for row in rows:
         image = cv2.imread(str(out / "frames" / file_of(row, scenario)), cv2.IMREAD_COLOR)
@@ -285,7 +292,7 @@ def _into_video(rows: list[Row], out: Path, scenario: Scenario) -> None:
             writer = cv2.VideoWriter(str(video), codec, fps, (image.shape[1], image.shape[0]))
         writer.write(image)
     if writer is None:
-        raise LumidockError(f"{video}: no picture to put into it")
+        raise LumidockError(f"{video}: there is no picture that can be decoded")
     writer.release()
     shutil.rmtree(out / "frames")
 
@@ -293,7 +300,7 @@ def _into_video(rows: list[Row], out: Path, scenario: Scenario) -> None:
 def write_detections(scenario: Scenario, station: Station, camera: Camera, seed: int, out: Path) -> int:
     """Write a scenario as bare detections into the folder `out`; returns the frame count.
 
-    Raises: InputError where the scenario has a port, which bare detections do not know.
+    Raises: InputError where the scenario has a flat port, which bare detections do not model.
     """
     require_possible(scenario, detections=True)
     out.mkdir(parents=True, exist_ok=True)
@@ -327,7 +334,7 @@ def _detection_spurious(frame: SimulatedFrame) -> list[Line]:
 
 
 def _detection_truth(frame: SimulatedFrame, station: Station) -> list[Line]:
-    """A light is visible when it made a detection; bare detections have no signal-to-noise ratio."""
+    """Lines of lights_truth.csv: a light is visible when it made a detection; there is no signal-to-noise ratio."""
     rows: list[Line] = []
     for i in np.flatnonzero(frame.in_view):
         u, v = frame.uv[i]
@@ -336,7 +343,7 @@ def _detection_truth(frame: SimulatedFrame, station: Station) -> list[Line]:
 
 
 def _write_poses(out: Path, names: list[str], t_ns: Iterable[int], poses: Array) -> None:
-    """True poses."""
+    """Write truth.csv."""
     columns = ("frame", "t_ns", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
     rows = (
         [name, t, *(f"{value:.9f}" for value in (*T[:3, 3], *quat_xyzw_from_rotation(T[:3, :3])))]

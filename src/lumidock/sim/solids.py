@@ -1,4 +1,4 @@
-"""The solids of a scenario: docks, basin, ropes, hull and jellyfish, as what rays are traced against."""
+"""Builds the solids of a scenario (docks, walls, ropes, hull, jellyfish) and their records for the ray caster."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from lumidock.sim.matter import Basin, Finish, Jellyfish, Matter, Solid
 from lumidock.station import Station
 
 _PATTERN = {"plain": PLAIN, "tiles": TILES, "sectors": SECTORS, "stripes": STRIPES}
-_CAGE_M = (1.0, 1.0, 5.0)  # half width, half height and depth of the shipped cage
-_BEHIND_M = 0.06  # from the lamps' plane back to the tubes that carry them
+_CAGE_M = (1.0, 1.0, 5.0)  # half width, half height and depth of the cage of the paper
+_BEHIND_M = 0.06  # from the lamps' plane back to the tubes of the cage
 _TUBE_M, _LAMP_M, _BRACKET_M = 0.03, 0.02, 0.012  # radii of tubes, lamp housings, brackets
-_THICK_M, _LARGE_M = 0.05, 30.0  # half thickness of walls, and half of their extent
-_PROUD_M = 0.02  # from a window back to the housing
+_THICK_M, _LARGE_M = 0.05, 30.0  # half thickness and half extent of walls
+_WINDOW_OUT_M = 0.02  # by which the window stands out of the housing
 
 
 def tube(start: Array, end: Array, radius_m: float, finish: str, end_radius_m: float | None = None) -> Solid:
-    """A tube, or with `end_radius_m` a cone, between two points (3,) of the dock."""
+    """A tube, or with `end_radius_m` a cone, between two points `start`, `end` (3,) in `dock`."""
     radii = (radius_m, radius_m if end_radius_m is None else end_radius_m)
     return Solid(kind="tube", center=_place(start), end=_place(end), radius_m=radii, finish=finish)
 
 
 def ring(center: Array, inner_m: float, outer_m: float, finish: str, axis: Array | None = None) -> Solid:
-    """A flat ring, or a disc, around a point (3,) of the dock; across z without an `axis` (3,)."""
+    """A flat ring, or a disc if `inner_m` is 0, around a point (3,) in `dock`; its normal is `axis` (3,) or z."""
     across = (0.0, 0.0, 1.0) if axis is None else _place(axis)
     return Solid(kind="ring", center=_place(center), axis=across, radius_m=(inner_m, outer_m), finish=finish)
 
@@ -45,16 +45,16 @@ def _place(p: Iterable[float]) -> tuple[float, float, float]:
 
 
 def lamp_bodies(station: Station) -> list[Solid]:
-    """A black housing with a metal front behind each lamp's window, which stands out and so shines sideways."""
+    """For each lamp a black housing with a metal front, behind the window, so that it does not block sideward light."""
     parts = []
     for p, axis in zip(station.p_dock, station.axis, strict=True):
-        parts.append(tube(p - _PROUD_M * axis, p - 0.07 * axis, _LAMP_M, "black"))
-        parts.append(ring(p - _PROUD_M * axis, 0.0, _LAMP_M, "metal", axis))
+        parts.append(tube(p - _WINDOW_OUT_M * axis, p - 0.07 * axis, _LAMP_M, "black"))
+        parts.append(ring(p - _WINDOW_OUT_M * axis, 0.0, _LAMP_M, "metal", axis))
     return parts
 
 
 def cage(station: Station) -> list[Solid]:
-    """Tubes along the edges of the cage, across it every 1.25 m, and a bracket from each lamp to the nearest tube."""
+    """Tubes along the edges of the cage and around it every 1.25 m, and a bracket from each lamp to a tube."""
     w, h, d = _CAGE_M
     front, rear = -_BEHIND_M, -d - _BEHIND_M
     corners = [(-w, -h), (-w, h), (w, h), (w, -h)]
@@ -73,7 +73,7 @@ def cage(station: Station) -> list[Solid]:
 
 
 def funnel(station: Station) -> list[Solid]:
-    """A white cone with dark struts and a rim inside the ring of lamps, a hub with screws, arms to the lamps."""
+    """A white cone with dark struts and a rim inside the ring of lamps, a hub with screws, and arms to the lamps."""
     lamps_m = float(np.hypot(station.p_dock[:, 0], station.p_dock[:, 1]).min())
     rim, hub, deep = 0.91 * lamps_m, 0.2 * lamps_m, 0.55 * lamps_m
     front = np.array([0.0, 0.0, -0.03])
@@ -96,7 +96,7 @@ def funnel(station: Station) -> list[Solid]:
 
 
 def plate(station: Station) -> list[Solid]:
-    """A white panel 3 cm behind the lamps with a dark entrance, a frame of tubes, and bolts in a row."""
+    """A white panel 3 cm behind the lamps with a dark entrance, a frame of tubes, and bolts along its edges."""
     low, high = station.p_dock.min(axis=0), station.p_dock.max(axis=0)
     middle, half = 0.5 * (low + high), 0.5 * (high - low) + [0.15, 0.15, 0.0]
     face = low[2] - 0.03
@@ -118,7 +118,7 @@ _DOCKS = {"cage": cage, "funnel": funnel, "plate": plate}
 
 
 def basin(knobs: Basin) -> list[Solid]:
-    """Walls behind and beside the dock, and a floor."""
+    """A wall behind the dock, walls left and right, and a floor."""
     parts, large = [], _LARGE_M
     if knobs.back_m:
         parts.append(
@@ -135,7 +135,7 @@ def basin(knobs: Basin) -> list[Solid]:
 
 
 def ropes(station: Station) -> list[Solid]:
-    """Two ropes that hold the dock from above, a thin line between them."""
+    """Two ropes that hold the dock from above, with a thin line between them."""
     half, top = 0.42 * np.ptp(station.p_dock[:, 0]), float(station.p_dock[:, 1].max())
     z = -_BEHIND_M
     sides = [
@@ -146,7 +146,7 @@ def ropes(station: Station) -> list[Solid]:
 
 
 def hull() -> list[Solid]:
-    """The nose of the own vehicle: yellow, glossy, in the lower part of the view."""
+    """The nose of the own vehicle: yellow and glossy, in the lower part of the picture."""
     return [
         Solid(kind="ellipsoid", frame="cam", center=(0.0, 0.30, 0.30), half_m=(0.30, 0.14, 0.30), finish="yellow"),
         Solid(
@@ -157,7 +157,7 @@ def hull() -> list[Solid]:
 
 
 def jellyfish(knobs: Jellyfish, T_dock_cam: Array, t_s: float, rng: np.random.Generator) -> list[Solid]:
-    """Bells that drift through the view; each stays at its distance from the camera."""
+    """Jellyfish that drift across the picture; each keeps its distance to the camera."""
     parts = []
     for _ in range(int(rng.integers(*knobs.count, endpoint=True))):
         r, far, speed = (rng.uniform(*reach) for reach in (knobs.radius_m, knobs.distance_m, knobs.speed_m_s))
@@ -171,7 +171,7 @@ def jellyfish(knobs: Jellyfish, T_dock_cam: Array, t_s: float, rng: np.random.Ge
 
 
 def still_solids(matter: Matter, station: Station) -> list[Solid]:
-    """All that does not move by itself."""
+    """All solids that are at rest in `dock` or in `cam`."""
     parts = list(matter.solids)
     if matter.dock != "none":
         parts += _DOCKS[matter.dock](station)
@@ -185,8 +185,11 @@ def still_solids(matter: Matter, station: Station) -> list[Solid]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """Solids with frames `T_frame_local` (S, 4, 4), where `in_cam` (S,) says which frame that is, and surfaces."""
+class SolidScene:
+    """S solids with their poses `T_frame_local` (S, 4, 4) in `cam` where `in_cam` (S,), else in `dock`.
+
+    `kind`, `size`, `bound_m` and `surface` (S,) are as in `raycast.Solids`; `surface` is an index of `finishes`.
+    """
 
     T_frame_local: Array
     in_cam: np.ndarray
@@ -197,56 +200,56 @@ class Scene:
     finishes: tuple[Finish, ...]
 
     @classmethod
-    def of(cls, parts: list[Solid], matter: Matter) -> Scene:
-        """The scene of some solids."""
+    def of(cls, parts: list[Solid], matter: Matter) -> SolidScene:
+        """The scene made of the solids `parts`; `matter` has their finishes."""
         names = list(dict.fromkeys(part.finish for part in parts))
-        T, kind, size, bound = zip(*(_traced(part) for part in parts), strict=True)
+        T, kind, size, bound = zip(*(_record(part) for part in parts), strict=True)
         return cls(
-            np.array(T),
-            np.array([part.frame == "cam" for part in parts]),
-            np.array(kind, np.int64),
-            np.array(size),
-            np.array(bound),
-            np.array([names.index(part.finish) for part in parts], np.int64),
-            tuple(matter.finish(name) for name in names),
+            T_frame_local=np.array(T),
+            in_cam=np.array([part.frame == "cam" for part in parts]),
+            kind=np.array(kind, np.int64),
+            size=np.array(size),
+            bound_m=np.array(bound),
+            surface=np.array([names.index(part.finish) for part in parts], np.int64),
+            finishes=tuple(matter.finish(name) for name in names),
         )
 
     def solids(self, T_dock_cam: Array) -> Solids:
-        """The solids in `cam`."""
+        """The solids in `cam`, for the ray caster."""
         T_cam_dock = se3_inverse(T_dock_cam)
         T = np.where(self.in_cam[:, None, None], self.T_frame_local, T_cam_dock @ self.T_frame_local)
         R = np.ascontiguousarray(T[:, :3, :3])
         return Solids(self.kind, R, np.ascontiguousarray(T[:, :3, 3]), self.size, self.bound_m, self.surface)
 
     def surfaces(self) -> Surfaces:
-        """Their surfaces."""
+        """The reflectances of `finishes`, for the kernels."""
 
         def column(name: str) -> Array:
             return np.array([getattr(finish, name) for finish in self.finishes], float)
 
         return Surfaces(
-            column("albedo"),
-            column("second"),
-            column("gloss"),
-            column("shininess"),
-            np.array([_PATTERN[finish.pattern] for finish in self.finishes], np.int64),
-            column("period"),
-            column("share"),
-            column("mottle"),
-            column("mottle_m"),
+            albedo=column("albedo"),
+            second=column("second"),
+            gloss=column("gloss"),
+            shininess=column("shininess"),
+            pattern=np.array([_PATTERN[finish.pattern] for finish in self.finishes], np.int64),
+            period=column("period"),
+            share=column("share"),
+            mottle=column("mottle"),
+            mottle_m=column("mottle_m"),
         )
 
 
-def _traced(part: Solid) -> tuple[Array, int, Array, float]:
-    """A solid's `T_frame_local` (4, 4), kind, size (4,) and the radius of a sphere around it."""
+def _record(part: Solid) -> tuple[Array, int, Array, float]:
+    """Pose `T_frame_local` (4, 4), kind, size (4,) and bounding radius m of one solid."""
     T, size, center = np.eye(4), np.zeros(4), np.array(part.center)
     if part.kind == "tube":
         way = np.array(part.end) - center
         length, (start_m, end_m) = float(np.linalg.norm(way)), part.radius_m
-        T[:3, :3], T[:3, 3] = _facing(way), 0.5 * (center + part.end)
+        T[:3, :3], T[:3, 3] = _rotation_to_axis(way), 0.5 * (center + part.end)
         size[:3] = 0.5 * (start_m + end_m), 0.5 * length, (end_m - start_m) / length
         return T, FRUSTUM, size, float(np.hypot(0.5 * length, max(start_m, end_m)))
-    T[:3, :3], T[:3, 3] = _facing(np.array(part.axis)), center
+    T[:3, :3], T[:3, 3] = _rotation_to_axis(np.array(part.axis)), center
     if part.kind == "ring":
         size[:2] = part.radius_m
         return T, RING, size, part.radius_m[1]
@@ -256,8 +259,8 @@ def _traced(part: Solid) -> tuple[Array, int, Array, float]:
     return T, ELLIPSOID, size, float(size.max())
 
 
-def _facing(axis: Array) -> Array:
-    """A rotation R_frame_local whose local z is along `axis` (3,); the identity for z."""
+def _rotation_to_axis(axis: Array) -> Array:
+    """A rotation R_frame_local (3, 3) that turns the local z axis to `axis` (3,); the identity if that is z."""
     z = axis / np.linalg.norm(axis)
     other = np.eye(3)[int(np.argmin(np.abs(z)))] if abs(z[2]) < 1.0 - 1e-12 else np.array([1.0, 0.0, 0.0])
     x = other - z * (other @ z)

@@ -1,4 +1,4 @@
-"""What befalls a stream of frames on its way: lost, frozen, doubled, swapped, cut and spoilt frames, clock jumps."""
+"""Faults of the stream of frames: lost, frozen, duplicated, disordered, truncated and blank frames, and clock jumps."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lumidock.sim.knobs import Stream
+from lumidock.sim.knobs import StreamFaults
 
-OVER_EXPOSED = 50.0  # times the exposure
+OVER_EXPOSED = 50.0  # factor on the exposure of a frame with the fault `over_exposed`
 _SPOILT = ("half_written", "black", "white", "over_exposed")
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One row of timestamps.csv: frame `number`, the one whose picture it shows, its stamp, and what went wrong."""
+    """One row of timestamps.csv: frame `number`, its stamp `t_ns` and its `fault`, if any.
+
+    `shows` is the number of the frame whose picture is in its file: another one while the stream is frozen.
+    """
 
     number: int
     shows: int
@@ -23,12 +26,12 @@ class Row:
 
     @property
     def name(self) -> str:
-        """The frame's name."""
+        """The frame's name in all files of the sequence."""
         return f"{self.number:06d}"
 
 
-def rows_of(knobs: Stream, t_ns: np.ndarray, rng: np.random.Generator) -> list[Row]:
-    """The rows of a sequence taken at `t_ns` (N,)."""
+def rows_of(knobs: StreamFaults, t_ns: np.ndarray, rng: np.random.Generator) -> list[Row]:
+    """The rows of a sequence of N frames taken at `t_ns` (N,), with faults drawn from `rng`."""
     jumps = np.cumsum(rng.random(len(t_ns)) < knobs.clock_jumps)
     stamps = t_ns + np.round(jumps * knobs.clock_jump_s * 1e9).astype(np.int64)
     rows: list[Row] = []

@@ -1,4 +1,4 @@
-"""What video adds to a picture: interlaced fields, subsampled colour, narrow levels."""
+"""Formats of analog and compressed video: interlaced fields, subsampled colour, renderer range of levels."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from lumidock.camera import Camera
 from lumidock.sim.knobs import Output
 
-_FOOT, _WHITE = 16.0, 235.0  # levels of black and white in studio range. Source: ITU-R BT.601-7, 2.5.3
+_FOOT, _WHITE = 16.0, 235.0  # 8-bit levels of black and white in renderer range. Source: ITU-R BT.601-7, 2.5.3
 
 
 def woven(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """A frame of the even rows of one picture (H, W[, 3]) and the odd rows of a later one."""
+    """An interlaced frame: even rows of the picture `first` (H, W[, 3]), odd rows of the later picture `second`."""
     frame = first.copy()
     frame[1::2] = second[1::2]
     return frame
 
 
 def as_video(picture: np.ndarray, output: Output) -> np.ndarray:
-    """A picture (H, W[, 3]) as it comes out of a video: one field of it, colour of half the size, narrow levels."""
+    """Convert a picture (H, W[, 3]) to the video format of the knobs: one field, subsampled colour, renderer range."""
     if output.fields == "single":
         picture = picture[::2]
     if output.chroma == "half" and picture.ndim == 3:
@@ -32,7 +32,7 @@ def as_video(picture: np.ndarray, output: Output) -> np.ndarray:
 
 
 def _subsampled(bgr: np.ndarray) -> np.ndarray:
-    """Through 8-bit Y'CbCr in studio range with colour at half the width and height. Source: ITU-R BT.601-7."""
+    """Convert to 8-bit Y'CbCr with colour at half the width and height, and back. Source: ITU-R BT.601-7."""
     height, width = bgr.shape[:2]
     even = cv2.copyMakeBorder(bgr, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
     back = cv2.cvtColor(cv2.cvtColor(even, cv2.COLOR_BGR2YUV_I420), cv2.COLOR_YUV2BGR_I420)
@@ -40,9 +40,9 @@ def _subsampled(bgr: np.ndarray) -> np.ndarray:
 
 
 def seen_by_field(camera: Camera, output: Output) -> Camera:
-    """The calibration of what is written: a single field has half of the rows, at twice the height of a pixel."""
+    """The calibration of the pictures as written: a single field has half of the rows, with pixels twice as high."""
     if output.fields != "single":
         return camera
     K = camera.K.copy()
-    K[1] *= 0.5  # row 2 v of the frame is row v of the field
+    K[1] *= 0.5  # row 2 v of the whole picture is row v of the field
     return replace(camera, K=K, height=(camera.height + 1) // 2)

@@ -1,1 +1,1 @@
-"""Hot loops of the simulator: rays, surfaces and light on solids."""
+"""Hot loops of the simulator: ray casting, and light on the surfaces of solids."""

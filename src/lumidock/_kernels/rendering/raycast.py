@@ -1,6 +1,6 @@
-"""Rays against boxes, frusta, rings and ellipsoids: the first hit, its normal, and whether anything lies between.
+"""Intersects rays with boxes, frusta, rings and ellipsoids: first hit, surface normal, and occlusion.
 
-Each solid has a frame of its own, `local`; directions are unit vectors, so that a ray's parameter is a length in m.
+Each solid has its own frame `local`. Directions are unit vectors, so that the parameter of a ray is a length in m.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ from lumidock._kernels.compiling import part
 from lumidock.datatypes import Array, Indices
 
 BOX, FRUSTUM, RING, ELLIPSOID = range(4)
-FAR_M = 100.0  # the range of what no ray hits
-_CLEAR_M = 1e-4  # a ray that starts on a surface does not hit it before this
+FAR_M = 100.0  # range of rays that hit nothing
+_CLEAR_M = 1e-4  # hits closer than this are ignored, so that a ray does not hit the surface it starts on
 _PARALLEL = 1e-12
 
 
 class Solids(NamedTuple):
-    """S solids in one frame, called `world` here: `R_world_local` (S, 3, 3), `center` (S, 3) m, `bound_m` (S,).
+    """S solids in one frame, here called `world`.
 
-    `kind` (S,) and `size` (S, 4) m: a box's three half lengths; a frustum's middle radius, half length along local z
-    and the radius's rise per length; a ring's inner and outer radius across local z; an ellipsoid's semi-axes.
-    `surface` (S,) is the row of its surface.
+    Rotation `R_world_local` (S, 3, 3), `center` (S, 3) m, radius of a bounding sphere `bound_m` (S,), and the index of
+    their surface in `shading.Surfaces`, `surface` (S,). The meaning of `size` (S, 4) m depends on `kind` (S,). Box:
+    three half lengths. Frustum: radius in the middle, half length along local z, change of radius per length. Ring:
+    inner and outer radius, with the normal along local z. Ellipsoid: three semi-axes.
     """
 
     kind: Indices
@@ -106,7 +107,7 @@ def _ellipsoid(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float,
 
 @part
 def hit(solids: Solids, s: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> tuple[float, int]:
-    """Length m along the ray to the first point on solid `s`, negative without one, and which face of a box it is."""
+    """Length m along a ray to its first hit on solid `s`, negative if none; axis of the face for a box."""
     R, c, size = solids.R_world_local[s], solids.center[s], solids.size[s]
     qx, qy, qz = ox - c[0], oy - c[1], oz - c[2]
     lx = R[0, 0] * qx + R[1, 0] * qy + R[2, 0] * qz
@@ -127,7 +128,7 @@ def hit(solids: Solids, s: int, ox: float, oy: float, oz: float, dx: float, dy: 
 
 @part
 def to_local(solids: Solids, s: int, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """A point of the world in the frame of solid `s`."""
+    """A point given in `world`, in the frame of solid `s`."""
     R, c = solids.R_world_local[s], solids.center[s]
     qx, qy, qz = x - c[0], y - c[1], z - c[2]
     return (
@@ -139,7 +140,7 @@ def to_local(solids: Solids, s: int, x: float, y: float, z: float) -> tuple[floa
 
 @part
 def normal(solids: Solids, s: int, face: int, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Unit normal, on either side, of solid `s` at a point of its surface."""
+    """Unit normal, of either sign, of solid `s` at a point of its surface."""
     R, size = solids.R_world_local[s], solids.size[s]
     lx, ly, lz = to_local(solids, s, x, y, z)
     kind = solids.kind[s]
@@ -165,7 +166,7 @@ def normal(solids: Solids, s: int, face: int, x: float, y: float, z: float) -> t
 def between(
     solids: Solids, some: Indices, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, length: float
 ) -> bool:
-    """Whether any of the solids `some[1:1 + some[0]]` lies on the first `length` m of a ray."""
+    """Whether any of the solids `some[1:1 + some[0]]` is hit within the first `length` m of a ray."""
     for k in range(some[0]):
         s = some[k + 1]
         c = solids.center[s]
@@ -184,7 +185,7 @@ def between(
 def may_hit(
     solids: Solids, s: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, half_angle: float
 ) -> bool:
-    """Whether a ray within `half_angle` rad of a direction can hit solid `s`; never wrongly False."""
+    """False if no ray within `half_angle` rad of a direction can hit solid `s`; True may be wrong."""
     bound = solids.bound_m[s]
     cx, cy, cz = solids.center[s, 0] - ox, solids.center[s, 1] - oy, solids.center[s, 2] - oz
     far = math.sqrt(cx * cx + cy * cy + cz * cz)
@@ -208,7 +209,7 @@ def may_hit(
 def _near_box(
     solids: Solids, s: int, cx: float, cy: float, cz: float, dx: float, dy: float, dz: float, grown: float
 ) -> bool:
-    """Whether a ray meets a box that is `grown` on all sides, whose center lies at (cx, cy, cz) from its start."""
+    """Whether a ray hits a box enlarged by `grown` m on all sides; its center is (cx, cy, cz) from the ray's start."""
     R, size = solids.R_world_local[s], solids.size[s]
     enter, leave = 0.0, 1e30
     for axis in range(3):
@@ -231,7 +232,7 @@ def _widest(size: Array) -> float:
 
 @part
 def _axis_apart(solids: Solids, s: int, cx: float, cy: float, cz: float, dx: float, dy: float, dz: float) -> float:
-    """Distance m between a ray and the axis of a frustum, whose center lies at (cx, cy, cz) from its start."""
+    """Distance m between a ray and the axis of a frustum, whose center is (cx, cy, cz) from the ray's start."""
     R, half = solids.R_world_local[s], solids.size[s, 1]
     ax, ay, az = R[0, 2], R[1, 2], R[2, 2]
     slant, ca, cd = ax * dx + ay * dy + az * dz, cx * ax + cy * ay + cz * az, cx * dx + cy * dy + cz * dz
@@ -245,14 +246,14 @@ def _axis_apart(solids: Solids, s: int, cx: float, cy: float, cz: float, dx: flo
     return math.sqrt(x * x + y * y + z * z)
 
 
-SIDE = 16  # cells along each side of a light's cube of directions
+SIDE = 16  # cells along each edge of the cube of directions around a light
 CELLS = 6 * SIDE * SIDE
-CELL_RAD = 0.5 * math.sqrt(2.0) * 2.0 / SIDE  # half the diagonal of the cell in the middle of a side, the largest one
+CELL_RAD = 0.5 * math.sqrt(2.0) * 2.0 / SIDE  # half the diagonal of a cell in the middle of a side, the largest
 
 
 @part
 def cell_of(dx: float, dy: float, dz: float) -> int:
-    """Which cell of a cube around a point a direction goes through."""
+    """Index of the cell of a cube around a point through which a direction passes."""
     ax, ay, az = abs(dx), abs(dy), abs(dz)
     if ax >= ay and ax >= az:
         side, a, b = (0 if dx > 0.0 else 1), dy / ax, dz / ax
@@ -279,8 +280,9 @@ def _middle_of(cell: int) -> tuple[float, float, float]:
 
 @part
 def list_blockers(solids: Solids, p: Array, blockers: NDArray[np.int16]) -> None:
-    """For each cell around each point `p` (L, 3), in `blockers` (L, CELLS, S + 1), how many solids it shows and which.
+    """List in `blockers` (L, CELLS, S + 1) for each point `p` (L, 3) and each cell of directions the solids in it.
 
+    The number of solids comes first, then their indices.
     Source: E. Haines, D. Greenberg, The light buffer, IEEE CG&A 6(9), 1986.
     """
     for point in range(len(p)):

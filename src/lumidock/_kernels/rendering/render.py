@@ -1,4 +1,4 @@
-"""A picture of matter in water: the first hit of every sample, shaded only as finely as the light changes."""
+"""Renders solids in water: first hit of the ray of every sample, light at as many samples as its changes need."""
 
 from __future__ import annotations
 
@@ -24,20 +24,21 @@ from lumidock._kernels.rendering.shading import (
 )
 from lumidock.datatypes import Array, Indices
 
-BLOCK = 16  # samples a side of what is shaded at once at most
-_SHARP = 30.0  # exponent of a curved surface's glossy lobe from which on parts of more than `_FINE` could miss its peak
-_FINE = 4
-_MARGIN = 1.1  # on the angle from the middle of a block to its corner, as rays between the corners are blended
-_FAINTS = 4.0  # of `World.faint`, what is added to that: less than the read noise
-_TOLERANCE = 0.03  # relative error of the light in the middle of a part that is interpolated
+BLOCK = 16  # samples along the side of a block, the largest part whose light is interpolated
+_SHARP = 30.0  # exponent of a curved surface's glossy lobe, over which parts larger than `_FINE` could miss its peak
+_FINE = 4  # samples along the side of a small part
+_MARGIN = 1.1  # on the angle from the middle of a block to its corner, as rays are interpolated between corners
+# error that the light in the middle of an interpolated part may have: relative, and in units of `LitScene.faint`, which
+# together are less than the read noise
+_TOLERANCE, _FAINTS = 0.03, 4.0
 
 
 class Sight(NamedTuple):
-    """How samples look.
+    """Rays and sensitivity of samples.
 
-    `rays` (m, n, 3) in `cam` and `etendue` (m, n) sr of a sample at every BLOCK-th one; electrons `gain` (C, 3) of each
-    channel per W/(m2 sr) and sr of each band; the angle `spread` between opposite corners of a block and the angle
-    `step` between samples, rad; how many samples lie between two columns of `Medium.lamp_sr`, `coarse`.
+    `rays` (m, n, 3) in `cam`, and `etendue` (m, n) sr of a sample, at the corners of blocks; electrons `gain` (C, 3) of
+    each channel per W/(m2 sr) and sr in each band; the angle `spread` rad between opposite corners of a block, and
+    `step` rad between samples; the number `coarse` of samples between two columns of `Medium.lamp_sr`.
     """
 
     rays: Array
@@ -49,11 +50,12 @@ class Sight(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Room for one block.
+    """Buffers for one block of B x B samples.
 
-    `rays` (B, B, 3), `etendue` (B, B); which solid and face was hit, `what` (B, B), at which range, `far` (B, B); the
-    `light` (B, B, 9) of samples; `all` solids, `some` that the block may show and a `few` that a part of it may show,
-    (S + 1,) each with their number first; parts that wait, `stack` (64, 3).
+    `rays` (B, B, 3), `etendue` (B, B); `what` (B, B): four times the solid that was hit plus its face, -1 for none;
+    `far` (B, B): its range m; `light` (B, B, 9): three parts in three bands. Lists of solids (S + 1,) with their count
+    first: `all`, `some` that rays of the block may hit, `few` that rays of a small part may. `stack` (64, 3): parts
+    that are not yet shaded.
     """
 
     rays: Array
@@ -68,10 +70,10 @@ class Scratch(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """What is drawn; its sides are whole blocks.
+    """The rendered samples; H and W are multiples of the block.
 
-    `electrons` (H, W, C), the ranges `range_m` (H, W) of what is seen, and the electrons of matter alone, without those
-    of the water before it, as means over `cells` (h, w, C), which are zero at first.
+    `electrons` (H, W, C); `range_m` (H, W) of the first hits; `cells` (h, w, C): electrons of solids without light that
+    water scatters, as means over cells, which must be zero at first.
     """
 
     electrons: NDArray[np.float32]
@@ -81,7 +83,7 @@ class Picture(NamedTuple):
 
 @part
 def _aim(sight: Sight, row: int, column: int, own: Scratch) -> None:
-    """Rays and etendue of a block's samples, between those of its corners."""
+    """Interpolate the rays and the etendue of a block's samples between its corners."""
     rays, step = sight.rays, 1.0 / BLOCK
     for i in range(BLOCK):
         fv = i * step
@@ -102,7 +104,7 @@ def _aim(sight: Sight, row: int, column: int, own: Scratch) -> None:
 
 @part
 def _keep(solids: Solids, among: Indices, ray: Array, half_angle: float, kept: Indices) -> None:
-    """Of the solids `among[1:1 + among[0]]`, put those into `kept` that rays around one may hit."""
+    """Put those of the solids `among[1:1 + among[0]]` into `kept` that rays within `half_angle` of `ray` may hit."""
     count = 0
     for k in range(among[0]):
         s = among[k + 1]
@@ -114,7 +116,7 @@ def _keep(solids: Solids, among: Indices, ray: Array, half_angle: float, kept: I
 
 @part
 def _cast(solids: Solids, spread: float, own: Scratch) -> None:
-    """The first hit of every sample of a block; only what a small part of it may show is tried there."""
+    """Find the first hit of every sample of a block, after excluding solids for the block and for its small parts."""
     _keep(solids, own.all, own.rays[BLOCK // 2, BLOCK // 2], _MARGIN * 0.5 * spread, own.some)
     for top in range(0, BLOCK, _FINE):
         for left in range(0, BLOCK, _FINE):
@@ -133,21 +135,22 @@ def _cast(solids: Solids, spread: float, own: Scratch) -> None:
 
 
 @part
-def _shade(world: LitScene, sight: Sight, place: tuple[int, int], own: Scratch, i: int, j: int) -> None:
-    """The light of one sample."""
+def _shade(scene: LitScene, sight: Sight, place: tuple[int, int], own: Scratch, i: int, j: int) -> None:
+    """Compute the light of one sample."""
     what, t = own.what[i, j], own.far[i, j]
     dx, dy, dz = own.rays[i, j]
     if what < 0:
         for band in range(PARTS):
             own.light[i, j, band] = 0.0
     else:
-        reflected(world, what >> 2, what & 3, dx, dy, dz, t, own.light, i, j)
+        reflected(scene, what >> 2, what & 3, dx, dy, dz, t, own.light, i, j)
     u, v = (place[1] + j) / sight.coarse, (place[0] + i) / sight.coarse
-    through_water(world.medium, dx, dy, dz, t, u, v, own.light, i, j)
+    through_water(scene.medium, dx, dy, dz, t, u, v, own.light, i, j)
 
 
 @part
 def _uniform(own: Scratch, top: int, left: int, side: int) -> bool:
+    """Whether all samples of a part hit the same face of the same solid."""
     what = own.what[top, left]
     for i in range(top, top + side):
         for j in range(left, left + side):
@@ -158,6 +161,7 @@ def _uniform(own: Scratch, top: int, left: int, side: int) -> bool:
 
 @part
 def _blended(own: Scratch, top: int, left: int, side: int, i: int, j: int, band: int) -> float:
+    """Light of sample (i, j) interpolated between the corners of a part."""
     last = side - 1
     fv, fu, light = (i - top) / last, (j - left) / last, own.light
     high = light[top, left, band] * (1.0 - fu) + light[top, left + last, band] * fu
@@ -166,26 +170,27 @@ def _blended(own: Scratch, top: int, left: int, side: int, i: int, j: int, band:
 
 
 @part
-def _smooth(world: LitScene, sight: Sight, place: tuple[int, int], own: Scratch, part: tuple[int, int, int]) -> bool:
-    """Whether the light in the middle of a part is what its corners say."""
+def _smooth(scene: LitScene, sight: Sight, place: tuple[int, int], own: Scratch, part: tuple[int, int, int]) -> bool:
+    """Shade the corners of a part; whether its light may be interpolated, as a test in its middle shows."""
     top, left, side = part
     last = side - 1
     for i in (top, top + last):
         for j in (left, left + last):
-            _shade(world, sight, place, own, i, j)
-    if side == _FINE and _flat(world.solids, own.what[top, left]):
+            _shade(scene, sight, place, own, i, j)
+    if side == _FINE and _flat(scene.solids, own.what[top, left]):
         return True
     i, j = top + side // 2, left + side // 2
-    _shade(world, sight, place, own, i, j)
+    _shade(scene, sight, place, own, i, j)
     for band in range(PARTS):
         value = own.light[i, j, band]
-        if abs(_blended(own, top, left, side, i, j, band) - value) > _TOLERANCE * value + _FAINTS * world.faint:
+        if abs(_blended(own, top, left, side, i, j, band) - value) > _TOLERANCE * value + _FAINTS * scene.faint:
             return False
     return True
 
 
 @part
 def _fill(own: Scratch, top: int, left: int, side: int) -> None:
+    """Interpolate the light of all samples of a part between its corners."""
     last = side - 1
     for band in range(PARTS):
         a, b = own.light[top, left, band], own.light[top, left + last, band]
@@ -200,43 +205,45 @@ def _fill(own: Scratch, top: int, left: int, side: int) -> None:
 
 @part
 def _flat(solids: Solids, what: int) -> bool:
+    """Whether a hit is on a plane face, or is none."""
     return what < 0 or solids.kind[what >> 2] == BOX or solids.kind[what >> 2] == RING
 
 
 @part
-def _shiny(world: LitScene, what: int) -> bool:
-    k = world.solids.surface[what >> 2]
-    return world.surfaces.gloss[k] > 0.0 and world.surfaces.shininess[k] > _SHARP
+def _shiny(scene: LitScene, what: int) -> bool:
+    """Whether a hit is on a surface with a narrow glossy lobe."""
+    k = scene.solids.surface[what >> 2]
+    return scene.surfaces.gloss[k] > 0.0 and scene.surfaces.shininess[k] > _SHARP
 
 
 @part
-def _shade_edge(world: LitScene, sight: Sight, place: tuple[int, int], own: Scratch, top: int, left: int) -> None:
-    """The light of a small part that shows several surfaces; all samples of a flat one get that of its first."""
+def _shade_edge(scene: LitScene, sight: Sight, place: tuple[int, int], own: Scratch, top: int, left: int) -> None:
+    """Shade a small part with several faces: each sample on its own, on plane faces only the first one."""
     for i in range(top, top + _FINE):
         for j in range(left, left + _FINE):
             what, found = own.what[i, j], -1
-            if _flat(world.solids, what):
+            if _flat(scene.solids, what):
                 for k in range((i - top) * _FINE + j - left):
                     if own.what[top + k // _FINE, left + k % _FINE] == what:
                         found = k
                         break
             if found < 0:
-                _shade(world, sight, place, own, i, j)
+                _shade(scene, sight, place, own, i, j)
                 continue
             for band in range(PARTS):
                 own.light[i, j, band] = own.light[top + found // _FINE, left + found % _FINE, band]
 
 
 @part
-def _near_lamp(world: LitScene, own: Scratch, top: int, left: int, side: int) -> bool:
-    """Whether a lamp is within twice a part's diagonal of its middle, so that its peak could be missed."""
+def _near_lamp(scene: LitScene, own: Scratch, top: int, left: int, side: int) -> bool:
+    """Whether a lamp is so near that interpolation could miss its peak: within twice the diagonal of a part."""
     last = side - 1
     a, b = own.far[top, left], own.far[top + last, left + last]
     across2 = 0.0
     for axis in range(3):
         across2 += (own.rays[top, left, axis] * a - own.rays[top + last, left + last, axis] * b) ** 2
     i, j = top + side // 2, left + side // 2
-    t, p = own.far[i, j], world.lights.p_cam
+    t, p = own.far[i, j], scene.lights.p_cam
     for lamp in range(len(p)):
         apart2 = 0.0
         for axis in range(3):
@@ -247,8 +254,8 @@ def _near_lamp(world: LitScene, own: Scratch, top: int, left: int, side: int) ->
 
 
 @part
-def _shade_block(world: LitScene, sight: Sight, place: tuple[int, int], own: Scratch) -> None:
-    """The light of every sample, from the corners of the largest parts in which it changes evenly."""
+def _shade_block(scene: LitScene, sight: Sight, place: tuple[int, int], own: Scratch) -> None:
+    """Shade a block: interpolate in parts where the light changes evenly, divide other parts into four."""
     own.stack[0, 0], own.stack[0, 1], own.stack[0, 2] = 0, 0, BLOCK
     waiting = 1
     while waiting > 0:
@@ -256,18 +263,18 @@ def _shade_block(world: LitScene, sight: Sight, place: tuple[int, int], own: Scr
         top, left, side = own.stack[waiting, 0], own.stack[waiting, 1], own.stack[waiting, 2]
         even = _uniform(own, top, left, side)
         if side == _FINE and not even:
-            _shade_edge(world, sight, place, own, top, left)
+            _shade_edge(scene, sight, place, own, top, left)
             continue
         if side == 2:
             for i in range(top, top + side):
                 for j in range(left, left + side):
-                    _shade(world, sight, place, own, i, j)
+                    _shade(scene, sight, place, own, i, j)
             continue
         what = own.what[top, left]
         if even and what >= 0:
-            peaked = side > _FINE and _shiny(world, what) and not _flat(world.solids, what)
-            even = not (peaked or _near_lamp(world, own, top, left, side))
-        if even and _smooth(world, sight, place, own, (top, left, side)):
+            peaked = side > _FINE and _shiny(scene, what) and not _flat(scene.solids, what)
+            even = not (peaked or _near_lamp(scene, own, top, left, side))
+        if even and _smooth(scene, sight, place, own, (top, left, side)):
             _fill(own, top, left, side)
             continue
         half = side // 2
@@ -279,9 +286,9 @@ def _shade_block(world: LitScene, sight: Sight, place: tuple[int, int], own: Scr
 
 
 @part
-def _expose(world: LitScene, sight: Sight, place: tuple[int, int], own: Scratch, picture: Picture) -> None:
-    """Write a block's electrons and ranges into the picture."""
-    surfaces, gain, cells = world.surfaces, sight.gain, picture.cells
+def _expose(scene: LitScene, sight: Sight, place: tuple[int, int], own: Scratch, picture: Picture) -> None:
+    """Convert the light of a block to electrons, and write them and the ranges into the picture."""
+    surfaces, gain, cells = scene.surfaces, sight.gain, picture.cells
     side = len(picture.electrons) // len(cells)
     share = 1.0 / (side * side)
     for i in range(BLOCK):
@@ -297,9 +304,9 @@ def _expose(world: LitScene, sight: Sight, place: tuple[int, int], own: Scratch,
             if what < 0:
                 continue
             s, cell_column = what >> 2, column // side
-            k = world.solids.surface[s]
+            k = scene.solids.surface[s]
             dx, dy, dz = own.rays[i, j]
-            other, factor = paint(world, s, what & 3, dx * t, dy * t, dz * t, sight.step * t)
+            other, factor = paint(scene, s, what & 3, dx * t, dy * t, dz * t, sight.step * t)
             own_part, other_part = factor * (1.0 - other), factor * other
             for band in range(BANDS):
                 albedo = surfaces.albedo[k, band] * own_part + surfaces.second[k, band] * other_part
@@ -312,21 +319,21 @@ def _expose(world: LitScene, sight: Sight, place: tuple[int, int], own: Scratch,
 
 
 @entry
-def render(world: LitScene, sight: Sight, own: Scratch, picture: Picture) -> None:
-    """Draw the picture; `world.blockers` is filled first."""
-    list_blockers(world.solids, world.lights.p_cam, world.blockers)
+def render(scene: LitScene, sight: Sight, own: Scratch, picture: Picture) -> None:
+    """Render the picture; fills `scene.blockers` first."""
+    list_blockers(scene.solids, scene.lights.p_cam, scene.blockers)
     for row in range(len(picture.electrons) // BLOCK):
         for column in range(picture.electrons.shape[1] // BLOCK):
             place = (row * BLOCK, column * BLOCK)
             _aim(sight, row, column, own)
-            _cast(world.solids, sight.spread, own)
-            _shade_block(world, sight, place, own)
-            _expose(world, sight, place, own, picture)
+            _cast(scene.solids, sight.spread, own)
+            _shade_block(scene, sight, place, own)
+            _expose(scene, sight, place, own, picture)
 
 
 @entry
 def seen_from_origin(solids: Solids, p_cam: Array, clear_m: Array, seen: Indices) -> None:
-    """Set `seen` (N,) to 1 where nothing lies between the origin and `clear_m` (N,) before `p_cam` (N, 3)."""
+    """Set `seen` (N,) to 1 where no solid lies between the camera and a point `clear_m` (N,) before `p_cam` (N, 3)."""
     everything = np.arange(-1, len(solids.kind))
     everything[0] = len(solids.kind)
     for k in range(len(p_cam)):
@@ -337,7 +344,7 @@ def seen_from_origin(solids: Solids, p_cam: Array, clear_m: Array, seen: Indices
 
 @entry
 def first_hits(solids: Solids, rays: Array, range_m: Array, which: Indices) -> None:
-    """Range m and solid (-1 without one) that each of `rays` (N, 3) from the origin meets first, tried one by one."""
+    """Range m and solid (-1 for none) of the first hit of each of `rays` (N, 3) from the camera, by brute force."""
     for k in range(len(rays)):
         range_m[k], which[k] = FAR_M, -1
         for s in range(len(solids.kind)):
@@ -348,18 +355,18 @@ def first_hits(solids: Solids, rays: Array, range_m: Array, which: Indices) -> N
 
 @entry
 def lobes(shininess: Array, cosine: Array, out: Array) -> None:
-    """The glossy lobe 1/sr of each exponent (N,) and cosine (N,)."""
+    """Values `out` (N,) 1/sr of the glossy lobe for exponents (N,) and cosines (N,)."""
     for k in range(len(out)):
         out[k] = lobe(shininess[k], cosine[k])
 
 
 def no_blockers(lamps: int, solids: int) -> NDArray[np.int16]:
-    """Room for what each lamp has in each direction."""
+    """Buffer for the lists of solids in each direction from each lamp."""
     return np.zeros((lamps, CELLS, solids + 1), np.int16)
 
 
 def scratch(solids: int) -> Scratch:
-    """Room for one block in a world of so many solids."""
+    """Buffers for one block in a scene of so many solids."""
     return Scratch(
         rays=np.zeros((BLOCK, BLOCK, 3)),
         etendue=np.zeros((BLOCK, BLOCK)),

@@ -1,6 +1,6 @@
-"""The light that matter sends to the camera: lamps and daylight on diffuse and glossy surfaces, through water.
+"""Light from solids to the camera: lamps and daylight reflected by diffuse and glossy surfaces, through water.
 
-Bands are those of `sim.water`. Everything stands in the frame `cam`, so that every line of sight starts at the origin.
+Bands are those of `sim.water`. All geometry is in the frame `cam`, so that every line of sight starts at the origin.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from lumidock.datatypes import Array, Indices
 
 PLAIN, TILES, SECTORS, STRIPES = range(4)
 BANDS = 3
-DIFFUSE, GLOSSY, WATER, PARTS = 0, 3, 6, 9  # where the parts of a sample's light begin, three bands each
+DIFFUSE, GLOSSY, WATER, PARTS = 0, 3, 6, 9  # index of the first of three bands of each part of a sample's light
 _PER_PI = 1.0 / math.pi
-_OFF_SURFACE_M = 5e-4  # from where a shadow ray starts
-_LOBE_END = 25.0  # of n (1 - cosine), where cosine^n is under 1e-10 and not worth its time
-_NOTHING = 0.02  # share of `World.faint` below which a lamp adds nothing that could be seen
-# share of daylight that a wall gets from the side, and a ceiling from below: radiance distribution and irradiance
+_OFF_SURFACE_M = 5e-4  # distance off the surface at which a shadow ray starts
+_LOBE_END = 25.0  # of n (1 - cosine), beyond which cosine^n is under 1e-10 and set to 0
+_NOTHING = 0.02  # share of `LitScene.faint` below which a lamp is left out
+# Irradiance of a vertical face and of a face turned down, over that from above: radiance distribution and irradiance
 # reflectance of coastal water. Source: C. Mobley, Light and Water, 1994, ch. 10
 _SIDE, _BELOW = 0.3, 0.05
 
@@ -30,9 +30,8 @@ _SIDE, _BELOW = 0.3, 0.05
 class Lights(NamedTuple):
     """L lamps.
 
-    Places `p_cam` (L, 3) m and `axis` (L, 3); radiant intensity W/sr in each band on the axis, `peak` (L, 3), which
-    falls as the `exponent` (L,) of the cosine, and `even` (L, 3), which all directions get; `radius_m` (L,) of the
-    window.
+    Positions `p_cam` (L, 3) m, unit `axis` (L, 3), and radius of the window `radius_m` (L,). The radiant intensity in
+    each band is `peak` cos^`exponent` + `even` W/sr, with `peak` and `even` (L, 3) and `exponent` (L,).
     """
 
     p_cam: Array
@@ -46,9 +45,9 @@ class Lights(NamedTuple):
 class Surfaces(NamedTuple):
     """K surfaces.
 
-    Diffuse reflectance `albedo` (K, 3), and that of the pattern's other part, `second` (K, 3); reflectance of the
-    glossy lobe, `gloss` (K,), and its exponent, `shininess` (K,); `pattern` (K,), its `size_m` (K,) and the `share`
-    (K,) of its other part; relative depth `mottle` (K,) of stains and their size `mottle_m` (K,).
+    Diffuse reflectance `albedo` (K, 3), and `second` (K, 3) in the lines of the pattern; reflectance of the glossy
+    lobe, `gloss` (K,), and its exponent, `shininess` (K,); `pattern` (K,), its `period` (K,), m or for sectors rad, and
+    the `share` (K,) of its lines; relative change of albedo `mottle` (K,) by stains and their size `mottle_m` (K,).
     """
 
     albedo: Array
@@ -56,7 +55,7 @@ class Surfaces(NamedTuple):
     gloss: Array
     shininess: Array
     pattern: Indices
-    size_m: Array
+    period: Array
     share: Array
     mottle: Array
     mottle_m: Array
@@ -65,10 +64,10 @@ class Surfaces(NamedTuple):
 class Medium(NamedTuple):
     """The water and what lights it.
 
-    Attenuation `beam` (3,) 1/m; daylight below the surface, `surface` (3,) W/m2, its `decay` (3,) 1/m, the upward
-    direction `up` (3,) and the camera's `depth_m`; what a metre of water scatters of daylight toward the camera,
-    `sideways` (N, 3) 1/(m sr), for N cosines to `up` from -1 to 1; the light of the vehicle's lamp that is scattered
-    on the way, `lamp_sr` (T, h, w, 3) W/(m2 sr), up to the ranges `edge_m` (T,), on a coarse grid.
+    Beam attenuation coefficient `beam` (3,) 1/m; irradiance of daylight just below the surface, `surface` (3,) W/m2,
+    its `decay` (3,) 1/m with depth, the upward direction `up` (3,) in `cam`, and the camera's `depth_m`; daylight
+    scattered into the line of sight, `sideways` (N, 3) 1/(m sr), for N cosines to `up` from -1 to 1; radiance of
+    headlamp light scattered before each range `edge_m` (T,), `lamp_sr` (T, h, w, 3) W/(m2 sr), on a coarse grid.
     """
 
     beam: Array
@@ -82,10 +81,10 @@ class Medium(NamedTuple):
 
 
 class LitScene(NamedTuple):
-    """All that a line of sight meets, and the irradiance W/m2 `faint` below which no shadow is looked for.
+    """Solids, lights and water. Lamps that add less than the irradiance `faint` W/m2 at a point get no shadow there.
 
-    `blockers` (L, CELLS, S + 1) lists what each lamp has in each direction, `noise` (n, n) are values in [-1, 1) for
-    stains, n a power of two.
+    `blockers` (L, CELLS, S + 1) lists for each lamp the solids in each direction, as `raycast.list_blockers` fills it;
+    `noise` (n, n) are random values in [-1, 1) for stains, n a power of two.
     """
 
     solids: Solids
@@ -99,9 +98,10 @@ class LitScene(NamedTuple):
 
 @part
 def lobe(shininess: float, cosine: float) -> float:
-    """Normalised Blinn-Phong: reflected over incident light 1/sr, of a lobe that reflects all of what comes head-on.
+    """Normalised Blinn-Phong lobe 1/sr; `cosine` is that of the normal to the half vector, `shininess` the exponent n.
 
-    Source: J. Blinn, SIGGRAPH 1977; its integral over the hemisphere is 8 pi (2^(-n/2) + n) / ((n + 2) (n + 4)).
+    It reflects all light that comes head-on: the integral of cos^n over the hemisphere is
+    8 pi (2^(-n/2) + n) / ((n + 2) (n + 4)). Source: J. Blinn, SIGGRAPH 1977.
     """
     n = shininess
     if cosine <= 0.0 or n * (1.0 - cosine) > _LOBE_END:
@@ -112,20 +112,20 @@ def lobe(shininess: float, cosine: float) -> float:
 
 @part
 def daylight(medium: Medium, band: int, height_m: float, cosine: float) -> float:
-    """Irradiance W/m2 of a surface `height_m` above the camera, whose normal has this `cosine` to the vertical."""
+    """Irradiance W/m2 by daylight on a face `height_m` above the camera; `cosine` of its normal to the vertical."""
     down = medium.surface[band] * math.exp(-medium.decay[band] * max(medium.depth_m - height_m, 0.0))
     return down * (_SIDE + ((1.0 - _SIDE) if cosine > 0.0 else (_SIDE - _BELOW)) * cosine)
 
 
 @part
 def reflected(
-    world: LitScene, s: int, face: int, dx: float, dy: float, dz: float, t: float, out: Array, i: int, j: int
+    scene: LitScene, s: int, face: int, dx: float, dy: float, dz: float, t: float, out: Array, i: int, j: int
 ) -> None:
-    """Put into `out[i, j]` (9,) what leaves a hit at `t` m toward the camera, W/(m2 sr), in each band.
+    """Compute the light that solid `s` reflects toward the camera from the point at `t` m on the ray (dx, dy, dz).
 
-    First the diffuse radiance over the albedo, then the glossy radiance.
+    `out[i, j]` (9,) gets in each band the diffuse radiance over the albedo, then the glossy radiance, W/(m2 sr).
     """
-    solids, lights, medium = world.solids, world.lights, world.medium
+    solids, lights, medium = scene.solids, scene.lights, scene.medium
     x, y, z = dx * t, dy * t, dz * t
     nx, ny, nz = normal(solids, s, face, x, y, z)
     if nx * dx + ny * dy + nz * dz > 0.0:
@@ -150,23 +150,23 @@ def reflected(
         beam = 0.0
         if ahead > 0.0:
             beam = ahead if lights.exponent[lamp] == 1.0 else ahead ** lights.exponent[lamp]
-        # E = pi L a^2 / (r^2 + a^2) on the axis of a diffuse disc of radius a, which has I = pi a^2 L
+        # irradiance on the axis of a diffuse disc of radius a and intensity I = pi a^2 L: pi L a^2 / (r^2 + a^2)
         scale = facing / (r2 + lights.radius_m[lamp] ** 2)
         most = 0.0
         for band in range(BANDS):
             most = max(most, beam * lights.peak[lamp, band] + lights.even[lamp, band])
-        if most * scale <= _NOTHING * world.faint:
+        if most * scale <= _NOTHING * scene.faint:
             continue
-        if most * scale > world.faint:
+        if most * scale > scene.faint:
             reach = r - lights.radius_m[lamp]
             ox, oy, oz = x + nx * _OFF_SURFACE_M, y + ny * _OFF_SURFACE_M, z + nz * _OFF_SURFACE_M
-            if between(solids, world.blockers[lamp, cell_of(-lx, -ly, -lz)], ox, oy, oz, lx, ly, lz, reach):
+            if between(solids, scene.blockers[lamp, cell_of(-lx, -ly, -lz)], ox, oy, oz, lx, ly, lz, reach):
                 continue
         bright = 0.0
-        if world.surfaces.gloss[k] > 0.0:
+        if scene.surfaces.gloss[k] > 0.0:
             hx, hy, hz = lx - dx, ly - dy, lz - dz
             cosine = (hx * nx + hy * ny + hz * nz) / math.sqrt(hx * hx + hy * hy + hz * hz)
-            bright = world.surfaces.gloss[k] * lobe(world.surfaces.shininess[k], cosine)
+            bright = scene.surfaces.gloss[k] * lobe(scene.surfaces.shininess[k], cosine)
         for band in range(BANDS):
             power = beam * lights.peak[lamp, band] + lights.even[lamp, band]
             if power > 0.0:
@@ -179,9 +179,10 @@ def reflected(
 def through_water(
     medium: Medium, dx: float, dy: float, dz: float, t: float, u: float, v: float, out: Array, i: int, j: int
 ) -> None:
-    """Attenuate `out[i, j]` (9,) over `t` m, and put into its last part what the water on the way scatters.
+    """Attenuate `out[i, j]` (9,) over `t` m of water, and set its last part to light that this water scatters.
 
-    `u`, `v` is the place on the grid of `lamp_sr`. Daylight is integrated in closed form, as `sim.around` does.
+    `u`, `v` are the coordinates on the grid of `lamp_sr`. Daylight is integrated in closed form, as in
+    `sim.surroundings`.
     """
     rise = dx * medium.up[0] + dy * medium.up[1] + dz * medium.up[2]
     length = min(t, max(medium.depth_m, 0.01) / rise) if rise > 1e-3 else t
@@ -205,7 +206,7 @@ def through_water(
 
 @part
 def _add_lamp(medium: Medium, t: float, u: float, v: float, out: Array, i: int, j: int) -> None:
-    """Add the scattered light of the vehicle's lamp, linear in range and across the grid."""
+    """Add scattered light of the headlamp, interpolated linearly in range and across the grid."""
     edges, lamp_sr = medium.edge_m, medium.lamp_sr
     step = 1
     while step < len(edges) - 1 and edges[step] < t:
@@ -227,7 +228,7 @@ def _add_lamp(medium: Medium, t: float, u: float, v: float, out: Array, i: int, 
 
 @part
 def _stains(noise: Array, x: float, y: float) -> float:
-    """Smooth noise in [-1, 1]: random values at integers, blended. Source: K. Perlin, SIGGRAPH 1985."""
+    """Smooth noise in [-1, 1]: random values at integer points, interpolated. Source: K. Perlin, SIGGRAPH 1985."""
     ix, iy = math.floor(x), math.floor(y)
     fx, fy = x - ix, y - iy
     fx, fy = fx * fx * (3.0 - 2.0 * fx), fy * fy * (3.0 - 2.0 * fy)
@@ -239,25 +240,24 @@ def _stains(noise: Array, x: float, y: float) -> float:
 
 
 @part
-def paint(world: LitScene, s: int, face: int, x: float, y: float, z: float, footprint_m: float) -> tuple[float, float]:
-    """Share of the pattern's other part at a point of solid `s`, and the factor by which stains change the albedo.
+def paint(scene: LitScene, s: int, face: int, x: float, y: float, z: float, footprint_m: float) -> tuple[float, float]:
+    """Share of a sample that is in lines of the pattern of solid `s`, and the factor of stains on the albedo.
 
-    `footprint_m` is the size of a sample there: what is finer is drawn as its mean.
+    `footprint_m` is the size of the sample on the surface, over which the pattern is averaged.
     """
-    surfaces, k = world.surfaces, world.solids.surface[s]
+    surfaces, k = scene.surfaces, scene.solids.surface[s]
     if surfaces.pattern[k] == PLAIN and surfaces.mottle[k] == 0.0:
         return 0.0, 1.0
-    lx, ly, lz = to_local(world.solids, s, x, y, z)
+    lx, ly, lz = to_local(scene.solids, s, x, y, z)
     a, b = lx, ly
-    if world.solids.kind[s] == BOX and face == 0:
+    if scene.solids.kind[s] == BOX and face == 0:
         a, b = ly, lz
-    elif world.solids.kind[s] == BOX and face == 1:
+    elif scene.solids.kind[s] == BOX and face == 1:
         a, b = lx, lz
     other = 0.0
-    size, share = surfaces.size_m[k], surfaces.share[k]
+    size, share = surfaces.period[k], surfaces.share[k]
     if surfaces.pattern[k] == TILES:
-        gap = 1.0 - (1.0 - _line(a, size, share, footprint_m)) * (1.0 - _line(b, size, share, footprint_m))
-        other = gap
+        other = 1.0 - (1.0 - _line(a, size, share, footprint_m)) * (1.0 - _line(b, size, share, footprint_m))
     elif surfaces.pattern[k] == SECTORS:
         radius = max(math.sqrt(lx * lx + ly * ly), 1e-6)
         other = _line(math.atan2(ly, lx) * radius, size * radius, share, footprint_m)
@@ -270,7 +270,7 @@ def paint(world: LitScene, s: int, face: int, x: float, y: float, z: float, foot
         for octave in range(3):
             if scale > footprint_m:
                 shift = 17.3 * octave + 5.7 * s
-                noise += depth * _stains(world.noise, a / scale + shift, b / scale + shift)
+                noise += depth * _stains(scene.noise, a / scale + shift, b / scale + shift)
             scale, depth = 0.35 * scale, 0.6 * depth
         factor = max(1.0 + noise, 0.05)
     return other, factor
@@ -278,7 +278,7 @@ def paint(world: LitScene, s: int, face: int, x: float, y: float, z: float, foot
 
 @part
 def _line(place: float, period: float, share: float, footprint: float) -> float:
-    """How much of a `footprint` around a place is in the lines of a grating, whose lines start at whole periods."""
+    """Share of a `footprint` around `place` that is in lines; each line begins at a multiple of `period`."""
     if footprint >= period:
         return share
     start = (place - 0.5 * footprint) / period

@@ -1,4 +1,4 @@
-"""Draws the solids of a scenario, lit by every lamp and by the day, into the electrons of the mosaic."""
+"""Renders the solids of a scenario, lit by all lamps and by daylight, as expected electrons of the mosaic."""
 
 from __future__ import annotations
 
@@ -14,40 +14,39 @@ from lumidock._kernels.rendering.raycast import FAR_M, Solids
 from lumidock._kernels.rendering.shading import Lights, LitScene, Medium
 from lumidock.datatypes import Array
 from lumidock.geometry import se3_inverse, transform_points
-from lumidock.sim import around
+from lumidock.sim import surroundings
 from lumidock.sim.canvas import Mosaic
 from lumidock.sim.lens import Lens
-from lumidock.sim.optics import PHOTON_J, SPECTRUM, Emitters, View, beam_exponent
+from lumidock.sim.optics import PHOTON_J, SPECTRUM, Emitters, Exposure, beam_exponent
 from lumidock.sim.scattering import halo
 from lumidock.sim.scenario import Scenario
-from lumidock.sim.solids import Scene, jellyfish, still_solids
+from lumidock.sim.solids import SolidScene, jellyfish, still_solids
 from lumidock.sim.water import absorption_scattering, phase_kind
 from lumidock.station import Station
 
-_MOST_SAMPLES = 2.0e6  # up to this many, pictures are drawn at twice their size, so that ropes and screws are no dots
-_FAINT_E = 0.25  # light below this many electrons is interpolated, and casts no shadow
-_COARSE = 16  # samples between two columns of the grid for what changes slowly
-_COSINES = 512
-_RINGS_M = 4  # ranges at which the light that matter scatters forward is spread
-_WINDOW = 7  # rays to a lamp's window, from which its visible share is counted
-_NOISE = np.random.default_rng(0).uniform(-1.0, 1.0, (128, 128))  # that stains are made of
-_STILL_PX = 0.3  # motion during the exposure that does not show
-_ROUND = 0.14  # least determinant over squared trace of the curvatures, a ratio of 5 between them
-_POINT_PX, _MOST_POINTS = (0.8, 2.4), 100  # Gaussians, in cells, that tell a compact point; as many are noted
-_MOUNT_M = 0.03  # what is this close to a lamp carries it and hides nothing of it
+_MOST_SAMPLES = 2.0e6  # small pictures are rendered at twice their size up to this; less aliasing of thin bodies
+_FAINT_E = 0.25  # lamps that add less than this many electrons to a pixel get no shadows
+_COSINES = 512  # angles to the vertical at which scattered daylight is tabulated
+_RANGE_LAYERS = 4  # layers of range for which forward scattering of light from solids is computed
+_WINDOW = 7  # points of a lamp's window that are tested for visibility
+_NOISE = np.random.default_rng(0).uniform(-1.0, 1.0, (128, 128))  # of which stains are made
+_NO_MOTION_PX = 0.3  # motion during the exposure below which no blur is computed, px
+_LEAST_ROUNDNESS = 0.14  # least determinant over squared trace of the Hessian: curvatures in a ratio of 5
+_POINT_SIGMAS, _MOST_POINTS = (0.8, 2.4), 100  # of the difference of Gaussians, in cells; most points per picture
+_MOUNT_M = 0.03  # solids this close to a lamp are its mount and do not hide it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
-    """Electrons (H, W) of matter and open water on the mosaic, the ranges (H, W) m, and what is in the way."""
+class MatterImage:
+    """Electrons (H, W) of solids and water on the mosaic, ranges (H, W) m of the solids, and the solids in `cam`."""
 
     electrons: Array
     range_m: Array
     solids: Solids
 
 
-class Painter:
-    """Draws matter through one lens."""
+class MatterRenderer:
+    """Renders the solids of one scenario through one lens."""
 
     def __init__(self, scenario: Scenario, station: Station, lens: Lens, colors: Mosaic) -> None:
         self.scenario, self.station, self.lens, self.colors = scenario, station, lens, colors
@@ -58,7 +57,7 @@ class Painter:
 
     @cached_property
     def _nodes_uv(self) -> Array:
-        """Pixels (m, n, 2) of the samples at the corners of blocks."""
+        """Pixels (m, n, 2) of the corners of blocks of samples."""
         v, u = ((np.arange(count + 1) * kernel.BLOCK + 0.5) / self.scale - 0.5 for count in (self.rows, self.columns))
         return np.stack(np.meshgrid(u, v), axis=-1)
 
@@ -74,24 +73,28 @@ class Painter:
 
     @cached_property
     def _lamp_sr(self) -> Array:
-        """Light of the vehicle's lamp that the water scatters, up to each range, on the coarse grid."""
+        """Radiance (T, m, n, 3) W/(m2 sr) of scattered headlamp light up to T ranges, at the corners of blocks."""
         lamp = self.scenario.around.headlamp
         if lamp is None:
             return np.zeros((0, 2, 2, 3))
-        return around.headlamp_sums(self.scenario, lamp, self._rays)
+        return surroundings.headlamp_sums(self.scenario, lamp, self._rays)
 
-    def draw(self, view: View, p_dock: Array, watts: Array, T_cam_later: Array, rng: np.random.Generator) -> Drawn:
-        """One frame; the M lamps stand at `p_dock` (M, 3) and have `watts` (M, 3) in each band.
+    def draw(
+        self, exposure: Exposure, p_dock: Array, watts: Array, T_cam_later: Array, rng: np.random.Generator
+    ) -> MatterImage:
+        """Render one frame with M lamps at `p_dock` (M, 3), of power `watts` (M, 3) W in each band.
 
-        `T_cam_later` is the camera's motion during the exposure.
+        `T_cam_later` (4, 4) is the camera's motion during the exposure.
         """
-        scene = self._scene(view, rng)
-        solids = scene.solids(view.T_dock_cam)
-        gain = self.colors.qe * (self.lens.aperture_m2 * view.exposure_s / PHOTON_J)
+        scene = self._scene(exposure, rng)
+        solids = scene.solids(exposure.T_dock_cam)
+        gain = self.colors.qe * (self.lens.aperture_m2 * exposure.exposure_s / PHOTON_J)
         faint = _FAINT_E / float(gain.max() * self._etendue.max())
-        lights = self._lights(view, p_dock, watts)
+        lights = self._lights(exposure, p_dock, watts)
         blockers = kernel.no_blockers(len(lights.exponent), len(solids.kind))
-        world = LitScene(solids, scene.surfaces(), lights, self._medium(view), faint, blockers, _NOISE)
+        lit_scene = LitScene(
+            solids, scene.surfaces(), lights, self._medium(exposure), faint=faint, blockers=blockers, noise=_NOISE
+        )
         spread = float(np.arccos(np.clip((self._rays[1:, 1:] * self._rays[:-1, :-1]).sum(-1).min(), -1.0, 1.0)))
         step = float(np.sqrt(self._etendue.max())) / self.scale
         sight = kernel.Sight(self._rays, self._etendue, gain, spread, step, float(kernel.BLOCK))
@@ -101,26 +104,26 @@ class Painter:
             np.empty(shape, np.float32),
             np.zeros((shape[0] // self._stride, shape[1] // self._stride, len(gain)), np.float32),
         )
-        kernel.render(world, sight, kernel.scratch(len(solids.kind)), picture)
-        return self._developed(picture, solids, self._smear(picture.range_m, T_cam_later))
+        kernel.render(lit_scene, sight, kernel.scratch(len(solids.kind)), picture)
+        return self._on_mosaic(picture, solids, self._smear(picture.range_m, T_cam_later))
 
     def _smear(self, range_m: Array, T_cam_later: Array) -> Array:
-        """How far (2,) samples the middle of the picture moves during the exposure."""
+        """Motion (2,) in samples of the middle of the picture during the exposure, for the median range."""
         middle = self.lens.camera.center_px[None]
         p_cam = self.lens.rays(middle) * float(np.median(range_m[:: kernel.BLOCK, :: kernel.BLOCK]))
         later = self.lens.project(transform_points(se3_inverse(T_cam_later), p_cam))
         return np.asarray((later - middle)[0] * self.scale)
 
-    def _scene(self, view: View, rng: np.random.Generator) -> Scene:
+    def _scene(self, exposure: Exposure, rng: np.random.Generator) -> SolidScene:
         knobs = self.scenario.matter
-        moving = jellyfish(knobs.jellyfish, view.T_dock_cam, view.t_s, rng) if knobs.jellyfish else []
-        return Scene.of(self.still + moving, knobs)
+        moving = jellyfish(knobs.jellyfish, exposure.T_dock_cam, exposure.t_s, rng) if knobs.jellyfish else []
+        return SolidScene.of(self.still + moving, knobs)
 
-    def _lights(self, view: View, p_dock: Array, watts: Array) -> Lights:
-        """The dock's lamps, and that of the vehicle, in `cam`."""
+    def _lights(self, exposure: Exposure, p_dock: Array, watts: Array) -> Lights:
+        """The lamps of the dock and the headlamp, in `cam`."""
         station, lamps = self.station, self.scenario.lamps
         n = beam_exponent(station.beam_deg)
-        p_cam, axis = view.p_cam(p_dock), station.axis @ view.T_dock_cam[:3, :3]
+        p_cam, axis = exposure.p_cam(p_dock), station.axis @ exposure.T_dock_cam[:3, :3]
         peak = watts * (1.0 - lamps.side_share) * ((n + 1.0) / (2.0 * np.pi))[:, None]
         even = watts * lamps.side_share / (4.0 * np.pi)
         radius = np.full(len(n), lamps.window_radius_m)
@@ -134,28 +137,28 @@ class Painter:
         lit = (peak + even).sum(axis=1) > 0.0
         return Lights(p_cam[lit], np.ascontiguousarray(axis[lit]), peak[lit], even[lit], n[lit], radius[lit])
 
-    def _medium(self, view: View) -> Medium:
-        """The water, as `sim.around` has it."""
+    def _medium(self, exposure: Exposure) -> Medium:
+        """The water and the daylight in it, as the kernels need them."""
         scenario = self.scenario
         a, b = absorption_scattering(scenario.water)
-        height = float(view.T_dock_cam[1, 3])
+        height = float(exposure.T_dock_cam[1, 3])
         return Medium(
             beam=a + b,
             surface=np.full(3, scenario.daylight.surface_w_m2),
-            decay=around.daylight_decay(scenario),
-            up=np.ascontiguousarray(view.T_dock_cam[1, :3]),
+            decay=surroundings.daylight_decay(scenario),
+            up=np.ascontiguousarray(exposure.T_dock_cam[1, :3]),
             depth_m=scenario.daylight.depth_m - height,
-            sideways=around.daylight_sideways(scenario, np.linspace(-1.0, 1.0, _COSINES)),
+            sideways=surroundings.daylight_sideways(scenario, np.linspace(-1.0, 1.0, _COSINES)),
             lamp_sr=self._lamp_sr,
-            edge_m=around.LAMP_EDGES_M if len(self._lamp_sr) else np.zeros(0),
+            edge_m=surroundings.LAMP_EDGES_M if len(self._lamp_sr) else np.zeros(0),
         )
 
-    def _developed(self, picture: kernel.Picture, solids: Solids, smear: Array) -> Drawn:
-        """Blurred by the lens, brought to the size of the picture, each pixel's own channel, spread by the water."""
+    def _on_mosaic(self, picture: kernel.Picture, solids: Solids, smear: Array) -> MatterImage:
+        """Blur by motion and lens, resample to pixels, select each pixel's channel, and add light scattered forward."""
         camera, knobs = self.lens.camera, self.lens.knobs
         spread = self._spread(picture.cells, picture.range_m)
         electrons: Array = picture.electrons
-        if np.hypot(*smear) > _STILL_PX:
+        if np.hypot(*smear) > _NO_MOTION_PX:
             electrons = np.asarray(cv2.filter2D(electrons, -1, _line(smear), borderType=cv2.BORDER_REPLICATE))
         blurred = self._cropped(np.asarray(cv2.GaussianBlur(electrons, (0, 0), knobs.blur_px * self.scale)))
         range_m = self._cropped(picture.range_m)
@@ -172,29 +175,29 @@ class Painter:
                 plane = _sampled(light[:, :, channel], mosaic[at].shape, step * self.scale / self._stride, row, column)
                 plane *= np.minimum(range_m[at] * np.float32(1.0 / source_m), np.float32(1.0))
                 mosaic[at] += plane
-        return Drawn(mosaic, np.ascontiguousarray(range_m), solids)
+        return MatterImage(mosaic, np.ascontiguousarray(range_m), solids)
 
     def _cropped(self, samples: Array) -> Array:
-        """Without what whole blocks have beyond the picture."""
+        """The samples inside the picture, as blocks extend beyond it."""
         camera = self.lens.camera
         return samples[: camera.height * self.scale, : camera.width * self.scale]
 
     @property
     def _stride(self) -> int:
-        """Samples between two cells of the grid on which light is spread."""
+        """Samples along the side of a cell of the grid on which forward scattering is computed."""
         return kernel.BLOCK // 2 if self.scale > 1 else kernel.BLOCK
 
     def _spread(self, coarse: Array, range_m: Array) -> list[tuple[float, Array]]:
-        """Ranges m of matter, and the light (h, w, C) from there that water scatters forward and the lens throws about.
+        """Light from solids that water and lens scatter forward, (h, w, C), for each of some layers of range.
 
-        Each range's share is spread as a lamp at that range would be; a nearer solid is before a part of it.
+        With each layer comes its range m. Each layer of range is convolved with the halo that a lamp at this range has.
         """
         height, width, channels = coarse.shape
         far = cv2.resize(range_m, (width, height), interpolation=cv2.INTER_NEAREST)
         solid = far < FAR_M
         if not solid.any():
             return []
-        edges = np.geomspace(far.min(), 1.001 * max(float(far[solid].max()), float(far.min()) + 0.1), _RINGS_M + 1)
+        edges = np.geomspace(far.min(), 1.001 * max(float(far[solid].max()), float(far.min()) + 0.1), _RANGE_LAYERS + 1)
         pixel_rad = float(np.sqrt(self.lens.solid_angle(self.lens.camera.center_px[None])[0])) / self.scale
         spread = []
         for near, end in pairwise(edges):
@@ -207,7 +210,7 @@ class Painter:
         return spread
 
     def _kernel(self, channel: int, range_m: float, cell_rad: float) -> Array:
-        """What a coarse cell of matter at a range sends to the cells around it, over what it shows directly."""
+        """Scattered light that a cell at a range adds to the cells around it, over its direct light: (65, 65)."""
         a, b = absorption_scattering(self.scenario.water)
         band = channel if len(self.colors.qe) == 3 else 1
         theta, scattered = halo(float(a[band]), float(b[band]), phase_kind(self.scenario.water), range_m, 0.0)
@@ -229,7 +232,7 @@ class Painter:
 
 
 def _line(smear: Array) -> Array:
-    """The kernel that smears evenly along (2,) px, its middle where the middle of the way is."""
+    """Convolution kernel of an even motion by `smear` (2,) samples, centred on the middle of the motion."""
     reach = int(np.ceil(0.5 * np.abs(smear).max())) + 1
     steps = 8 * int(np.ceil(np.hypot(*smear)))
     along = (np.arange(steps) + 0.5) / steps - 0.5
@@ -242,17 +245,17 @@ def _line(smear: Array) -> Array:
 
 
 def compact_points(electrons: Array, read_noise_e: float) -> Array:
-    """Pixels (R, 2) of the compact bright points of a picture (H, W) of electrons, at most `_MOST_POINTS`.
+    """Pixels (R, 2) of compact bright points in a picture (H, W) of electrons, the brightest `_MOST_POINTS` of them.
 
-    Maxima of the difference of two Gaussians over cells of 2 x 2 pixels, which noise does not hide, which stand out
-    from what is around them and which are no ridges. Source: D. Lowe, IJCV 60, 2004, 3 and 4.1.
+    Maxima of a difference of Gaussians over cells of 2 x 2 pixels that exceed four times the noise and a fifth of the
+    light around them, and are not ridges. Source: D. Lowe, IJCV 60, 2004, sections 3 and 4.1.
     """
     cells = cv2.resize(electrons, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    narrow, wide = (cv2.GaussianBlur(cells, (0, 0), sigma) for sigma in _POINT_PX)
+    narrow, wide = (cv2.GaussianBlur(cells, (0, 0), sigma) for sigma in _POINT_SIGMAS)
     apart = narrow - wide
     noise = np.sqrt(np.maximum(wide, 0.0) + read_noise_e**2)
     uu, vv, cross = (cv2.Sobel(apart, -1, dx, dy, ksize=3) for dx, dy in ((2, 0), (0, 2), (1, 1)))
-    ridge = uu * vv - cross * cross < _ROUND * (uu + vv) ** 2
+    ridge = uu * vv - cross * cross < _LEAST_ROUNDNESS * (uu + vv) ** 2
     peaks = (
         ~ridge & (apart == cv2.dilate(apart, np.ones((5, 5), np.uint8))) & (apart > np.maximum(4.0 * noise, 0.2 * wide))
     )
@@ -267,7 +270,10 @@ def _convolved(plane: Array, kernel_px: Array) -> Array:
 
 
 def _sampled(coarse: Array, shape: tuple[int, ...], scale: float, row: int, column: int) -> Array:
-    """A coarse grid (h, w) at the sites (H, W) of a mosaic that are `scale` cells apart, from a row and a column on."""
+    """A coarse grid (h, w) interpolated at those pixels of a mosaic that measure one channel: `shape` (H, W).
+
+    These pixels are `scale` cells of the grid apart; the first one is in `row` and `column` of the pattern.
+    """
     half = 0.5 * scale
     to_cell = np.array([[scale, 0.0, half * (column + 0.5) - 0.5], [0.0, scale, half * (row + 0.5) - 0.5]])
     return np.asarray(
@@ -281,17 +287,17 @@ def _sampled(coarse: Array, shape: tuple[int, ...], scale: float, row: int, colu
     )
 
 
-def visible_share(solids: Solids, seen: Emitters, radius_m: float) -> Array:
-    """Share (N,) of each emitter's window, of `radius_m`, that no solid hides."""
-    count = len(seen)
-    across = np.cross(seen.p_cam, [0.0, 1.0, 0.0])
+def visible_share(solids: Solids, emitters: Emitters, radius_m: float) -> Array:
+    """Share (N,) of the window of each emitter that solids do not hide; `radius_m` is that of the windows."""
+    count = len(emitters)
+    across = np.cross(emitters.p_cam, [0.0, 1.0, 0.0])
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
-    down = np.cross(seen.p_cam, across)
+    down = np.cross(emitters.p_cam, across)
     down /= np.maximum(np.linalg.norm(down, axis=1, keepdims=True), 1e-9)
     k = np.arange(_WINDOW) + 0.5
     r, angle = radius_m * np.sqrt(k / _WINDOW), k * np.pi * (3.0 - np.sqrt(5.0))
     points = (
-        seen.p_cam[:, None]
+        emitters.p_cam[:, None]
         + (r * np.cos(angle))[:, None] * across[:, None]
         + (r * np.sin(angle))[:, None] * down[:, None]
     )
