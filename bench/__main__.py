@@ -13,13 +13,13 @@ from pathlib import Path
 
 from bench import (
     acquisition,
+    association,
     configuration,
     contact_sheet,
     detection,
     detector_errors,
     dockings,
     docks,
-    doors,
     images,
     nominal,
     rendering,
@@ -32,7 +32,7 @@ from bench import (
 BENCHES = {
     "acquisition": acquisition,
     "nominal": nominal,
-    "doors": doors,
+    "association": association,
     "table1": table1,
     "images": images,
     "speed": speed,

@@ -1,4 +1,4 @@
-"""Detections before any naming, over rendered sequences: recall, false lamps, centres and their covariances."""
+"""Detections before any association, over rendered sequences: recall, false lamps, centres and their covariances."""
 
 from __future__ import annotations
 

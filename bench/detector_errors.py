@@ -1,8 +1,8 @@
 """What the default detector does to lights, on rendered frames of every shipped docking: the table of `sim.measured`.
 
 A run of each scenario whose lights look different, a frame every 0.6 s. Every light counts that shines into the picture
-and is no fault of the scenario; one that does not stand out of the noise is missed, whatever spot is near. What of the
-detector's spots belongs to no lamp is a false spot.
+and is no fault of the scenario; one that does not stand out of the noise is missed, whatever detection is near. What of the
+detections belongs to no light is a false detection.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from lumidock.streams.images import decode_image
 
 SEED, INTERVAL_S = 7300, 0.6
 EDGES_M = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
-_NEAR_PX = 6.0  # farther from its lamp a spot is a false one; less would hide the worst errors
+_NEAR_PX = 6.0  # farther from its lamp a detection is a false one; less would hide the worst errors
 _ON_PX = 1.0  # so near to a hot pixel, and not to its lamp, it is the hot pixel that is seen
 _LEAST_SNR = 4.0
-_KEPT = {"front": 150, "rear": 150, "false": 30}  # spots of a cell that are written down: of lights all, here
+_KEPT = {"front": 150, "rear": 150, "false": 30}  # detections of a cell that are written down: of lights all, here
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Cell:
     detections: list[list[float]] = field(default_factory=list)
 
     def as_dict(self, most: int) -> dict[str, Any]:
-        """For the file: spots by rising error, false ones by p_light, thinned out evenly to `most`."""
+        """For the file: detections by rising error, false ones by p_light, thinned out evenly to `most`."""
         rows = sorted(self.detections, key=lambda row: row[1:3])
         if len(rows) > most:
             rows = [rows[i] for i in np.linspace(0, len(rows) - 1, most).round().astype(int)]
@@ -64,7 +64,7 @@ def band(range_m: Array) -> np.ndarray:
 def add(cells: Cells, found: Detections, lit: Array, spurious: Array, hot: Array, dock_m: float) -> None:
     """Count one frame.
 
-    `lit` (M, 5) are the lights' pixels, range m, whether rear and SNR; `strays` (S, 2) px are other lamps, and `hot`
+    `lit` (M, 5) are the lights' pixels, range m, whether rear and SNR; `others` (S, 2) px are other lamps, and `hot`
     (H, 2) px bad pixels.
     """
     shows = np.where(lit[:, 4:] > _LEAST_SNR, lit[:, :2], np.inf)

@@ -31,7 +31,7 @@ from lumidock.station import Station
 from lumidock.streams.sources import open_source
 
 _Z_M, _ROUNDS, _SEED, _STARTS = (18.0, 9.0, 2.3), 7, 7100, 3
-_LIGHTS, _STRAYS = (7, 13, 25, 50), (0, 2, 10, 50)
+_LIGHTS, _SPURIOUS = (7, 13, 25, 50), (0, 2, 10, 50)
 _OUTPUT = {
     "mono8": ("output.pixels=mono8", "output.color=false", "output.file=png"),
     "bayer_rggb8": ("output.pixels=bayer8", "output.file=png"),
@@ -119,7 +119,7 @@ def growth(spurious: tuple[int, ...]) -> dict[str, float]:
 
 
 def matching_growth(lights: tuple[int, ...], spurious: tuple[int, ...]) -> dict[int, dict[int, tuple[float, float]]]:
-    """Median and largest ms of naming one frame without history, by lights, then spurious spots; some are dark.
+    """Median and largest ms of associating one frame without history, by lights, then spurious detections; some are dark.
 
     The lights stand anywhere on two planes 5 m apart, as many on either, and are seen from 9 m without colour.
     """
@@ -242,15 +242,17 @@ def main() -> tuple[dict[str, object], list[str]]:
             content[f"{kind}: {job}"] = medians
             lines.append(f"| {kind}: {job} | " + " | ".join(f"{m:.2f} ({m / one_pass:.1f})" for m in medians) + " |")
     content["growth_ms"] = grown = growth((2, 20, 200))
-    content["matching_ms"] = named = matching_growth(_LIGHTS, _STRAYS)
+    content["matching_ms"] = named = matching_growth(_LIGHTS, _SPURIOUS)
     (cold_s, warm_s), peak = start_up(frames[9.0, "bgr8"][0]), peak_memory()
     content |= {"start_cold_s": cold_s, "start_warm_s": warm_s, "peak_mib": peak, "machine": machine()}
     lines += ["", "Full search of a mono frame, ms: " + ", ".join(f"{k} {v:.2f}" for k, v in grown.items()) + "."]
     lines += [
         "",
-        "| naming a frame without history, ms: median / largest | " + " | ".join(map(str, _STRAYS)) + " spurious |",
+        "| associating a frame without history, ms: median / largest | "
+        + " | ".join(map(str, _SPURIOUS))
+        + " spurious |",
     ]
-    lines += ["|---" * (len(_STRAYS) + 1) + "|"]
+    lines += ["|---" * (len(_SPURIOUS) + 1) + "|"]
     for m, row in named.items():
         lines.append(f"| {m} lights | " + " | ".join(f"{a:.2f} / {b:.2f}" for a, b in row.values()) + " |")
     lines.append("")

@@ -1,4 +1,4 @@
-"""Cost of the default method through its light door, on one core: cold matches by kind of frame, and a warm frame."""
+"""Cost of associating detections on one core: acquisition by kind of frame, and a tracked frame."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import load_scenario
 
 _FRAMES, _SEED = 300, 300
-_COLD = {
+_ACQUISITIONS = {
     "one layer, 6 lights": ("missing-1", ()),
     "one layer, 1-3 missing + 1-5 spurious": ("missing-spurious", ()),
     "one layer, 7 lights + 20 spurious": ("missing-spurious", ("faults.missing=0", "faults.spurious=20")),
@@ -27,7 +27,7 @@ _COLD = {
 }
 
 
-def cold_ms(scenario: str, settings: tuple[str, ...]) -> np.ndarray:
+def acquisition_ms(scenario: str, settings: tuple[str, ...]) -> np.ndarray:
     """Milliseconds (N,) of `match.acquire` on each of some frames of a scenario."""
     station, camera, config = shipped_station(), shipped_camera(), Config()
     model, expected = station_model(station, camera, config.match), attitude_prior(None, config.prior)
@@ -40,8 +40,8 @@ def cold_ms(scenario: str, settings: tuple[str, ...]) -> np.ndarray:
     return np.array(times[1:])
 
 
-def warm_ms() -> np.ndarray:
-    """Milliseconds (N,) of each frame of a nominal run through the light door, the cold ones left out."""
+def tracking_ms() -> np.ndarray:
+    """Milliseconds (N,) of each frame of a nominal run through `process_detections`, those without history left out."""
     localizer = Localizer(shipped_station(), shipped_camera())
     frames: list[Detections] = [
         frame.detections
@@ -58,10 +58,12 @@ def warm_ms() -> np.ndarray:
 
 def main() -> tuple[dict[str, object], list[str]]:
     """One row a kind of frame."""
-    warm_ms()  # compiles
+    tracking_ms()  # compiles
     content: dict[str, object] = {}
-    lines = ["| light door, ms a frame | median | 95 % | slowest |", "|---|---|---|---|"]
-    rows = {f"cold: {name}": cold_ms(*what) for name, what in _COLD.items()} | {"warm, nominal run": warm_ms()}
+    lines = ["| association, ms a frame | median | 95 % | slowest |", "|---|---|---|---|"]
+    rows = {f"acquisition: {name}": acquisition_ms(*what) for name, what in _ACQUISITIONS.items()} | {
+        "tracking, nominal run": tracking_ms()
+    }
     for name, times in rows.items():
         median, p95, slowest = np.percentile(times, [50, 95, 100])
         lines.append(f"| {name} | {median:.2f} | {p95:.2f} | {slowest:.2f} |")
