@@ -1,8 +1,8 @@
 """What the default detector does to lights, on rendered frames of every shipped docking: the table of `sim.measured`.
 
 A run of each scenario whose lights look different, a frame every 0.6 s. Every light counts that shines into the picture
-and is no fault of the scenario; one that does not stand out of the noise is missed, whatever detection is near. What of the
-detections belongs to no light is a false detection.
+and is no fault of the scenario; one that does not stand out of the noise is missed, whatever detection is near. A
+detection that belongs to no light is a false one.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def band(range_m: Array) -> np.ndarray:
 def add(cells: Cells, found: Detections, lit: Array, spurious: Array, hot: Array, dock_m: float) -> None:
     """Count one frame.
 
-    `lit` (M, 5) are the lights' pixels, range m, whether rear and SNR; `others` (S, 2) px are other lamps, and `hot`
+    `lit` (M, 5) are the lights' pixels, range m, whether rear and SNR; `spurious` (S, 2) px are other lamps, and `hot`
     (H, 2) px bad pixels.
     """
     shows = np.where(lit[:, 4:] > _LEAST_SNR, lit[:, :2], np.inf)

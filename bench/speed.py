@@ -119,7 +119,7 @@ def growth(spurious: tuple[int, ...]) -> dict[str, float]:
 
 
 def matching_growth(lights: tuple[int, ...], spurious: tuple[int, ...]) -> dict[int, dict[int, tuple[float, float]]]:
-    """Median and largest ms of associating one frame without history, by lights, then spurious detections; some are dark.
+    """Median and largest ms of associating one frame, by lights, then spurious detections; some are dark.
 
     The lights stand anywhere on two planes 5 m apart, as many on either, and are seen from 9 m without colour.
     """
