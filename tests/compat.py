@@ -120,7 +120,7 @@ def worked(lumidock, work):
 
 def said(command, *, codes=(0,), **options):
     """Standard output of a command that succeeds."""
-    done = subprocess.run(command, capture_output=True, text=True, timeout=1800, check=False, **options)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=3600, check=False, **options)
     last = (done.stderr or done.stdout).strip()[-2000:]
     assert done.returncode in codes, f"{' '.join(map(str, command[-8:]))}: exit code {done.returncode}\n{last}"
     return done.stdout

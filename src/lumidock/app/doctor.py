@@ -63,7 +63,7 @@ def examine() -> list[Finding]:
 
 
 def _python() -> Finding:
-    fits = sys.version_info >= (3, 11)
+    fits = (3, 10) <= sys.version_info < (3, 14)
     return Finding("ok" if fits else "bad", "Python", f"{platform.python_version()}, {platform.machine()}")
 
 
