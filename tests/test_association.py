@@ -107,7 +107,7 @@ def test_an_association_that_would_take_too_long_assigns_nothing(rng):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_association_identifies_the_lights_however_wide_the_gates(seed):
-    """At six frames a second and with no speed known yet, a dozen spots lie in the gate of every light."""
+    """At six frames a second and with no speed known yet, a dozen detections lie in the gate of every light."""
     frames = frames_of("nominal", "path.start_z_m=19", "path.end_z_m=6", "path.frame_interval_s=0.1667", seed=seed)
     frames = [frame for frame in frames if (frame.light >= 0).sum() >= 8]
     for before, frame in pairwise(frames):

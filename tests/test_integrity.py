@@ -125,7 +125,7 @@ def test_levels_rise_with_the_covariance_and_with_less_risk(rng):
     assert (levels_of(bounds([hypothesis(T_dock_cam, P6)], IntegrityConfig(risk=1e-7))) > plain).all()
 
 
-def test_levels_hold_every_other_belief_that_is_not_out_of_the_question(rng):
+def test_levels_hold_every_other_hypothesis_that_is_not_out_of_the_question(rng):
     config = IntegrityConfig()
     for _ in range(20):
         T_a, T_b = at(8.0, rng), at(9.0, rng)

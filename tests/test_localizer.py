@@ -41,7 +41,7 @@ def approach():
 
 
 def nearby():
-    """A second of the approach at 12 m, with a lock from its third frame on."""
+    """A second of the approach at 12 m, with a confirmed track from its third frame on."""
     settings = ("path.start_z_m=12", "path.end_z_m=11", "path.frame_interval_s=0.0666667")
     return [frame.detections for frame in frames_of("approach", *settings)]
 
@@ -154,8 +154,8 @@ def test_four_lights_that_leave_two_poses_promise_neither():
 
 
 @pytest.mark.parametrize("seed", [101, 300, 301])
-def test_three_lights_and_a_stray_beside_a_fourth_prove_no_pose(seed):
-    """A stray spot in the gate of a missing light makes a fourth: one frame must not make a valid pose of them."""
+def test_three_lights_and_clutter_beside_a_fourth_prove_no_pose(seed):
+    """A spurious detection in the gate of a missing light makes a fourth: one frame must not make a valid pose of them."""
     prior = {"roll_deg": 3.0, "pitch_deg": 3.0, "yaw_deg": 3.0}
     config = Config.model_validate({"prior": prior, "match": {"steady": 0.0}})
     localizer = Localizer(STATION, CAMERA, config)
@@ -169,7 +169,7 @@ def test_three_lights_and_a_stray_beside_a_fourth_prove_no_pose(seed):
 def test_a_slow_camera_follows_no_wrong_names(seed):
     """Six frames a second: wide gates, layers that enter while the speed is unknown, clutter where lights were.
 
-    Each run once had a track that an unfinished search, or one frame against a hundred, had given wrong names.
+    Each run once had a track that an unfinished search, or one frame against a hundred, had given wrong identities.
     """
     frames = frames_of("nominal", "path.frame_interval_s=0.1667", seed=seed)
     for frame, fix in zip(frames, run(frames), strict=True):
@@ -325,7 +325,7 @@ def test_the_same_picture_again_is_frozen():
     assert localizer.process_detections(seen[7]).valid
 
 
-def test_too_many_spots_are_refused(rng):
+def test_too_many_detections_are_refused(rng):
     localizer = Localizer(STATION, CAMERA)
     crowd = Detections.from_uv("f", 0, rng.uniform(0, 2000, (201, 2)))
     fix = localizer.process_detections(crowd)

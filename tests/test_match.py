@@ -95,7 +95,7 @@ def test_the_order_of_detections_does_not_matter(rng):
         assert_array_equal(np.where(b >= 0, order[b], -1), a)
 
 
-def test_the_same_spots_give_the_same_bytes():
+def test_the_same_detections_give_the_same_bytes():
     for frame in frames("joint", "path.count=5"):
         one, other = acquire(frame.detections), acquire(frame.detections)
         assert one.margin == other.margin
@@ -154,25 +154,25 @@ def test_a_measured_attitude_names_a_rolled_camera(roll_deg, rng):
         assert answer(found)
         assert wrong(found.hypotheses[0].assignment, order) == 0
         assert (found.hypotheses[0].assignment >= 0).sum() == 7
-        # the prior about head-on does not allow it: nothing, rather than another naming
+        # the prior about head-on does not allow it: nothing, rather than another association
         without = acquire(replace(seen, attitude=None))
         assert not answer(without)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
-def test_fewer_than_three_spots_are_too_few(n, rng):
+def test_fewer_than_three_detections_are_too_few(n, rng):
     found = acquire(seen_from(pose(HEAD_ON, [0, 0, 8.0]), np.arange(n), rng))
     assert (found.hypotheses, found.other_poses, found.reason) == ((), (), "too_few")
     assert not answer(found)
     assert not verify.is_answer(found, CONFIG.match)
 
 
-def test_three_spots_alone_are_no_answer(rng):
+def test_three_detections_alone_are_no_answer(rng):
     for lights in ([0, 2, 6], [0, 4, 5], [7, 9, 11]):
         assert not answer(acquire(seen_from(pose(HEAD_ON, [0, 0, 8.0]), np.array(lights), rng)))
 
 
-def test_spots_that_hardly_look_like_lamps_stay_out(rng):
+def test_detections_that_hardly_look_like_lamps_stay_out(rng):
     for frame in frames("missing-spurious", "path.count=5", "faults.missing=0", "faults.spurious=0", seed=8):
         n, junk = len(frame.light), rng.uniform(0, 2000, (90, 2))
         uv = np.concatenate([frame.detections.uv, junk])
@@ -189,7 +189,7 @@ def test_a_frame_of_more_lamps_than_can_be_looked_at_is_no_answer(rng):
     assert (found.reason, found.hypotheses) == ("too_many", ())
 
 
-def test_spots_at_one_place_or_in_a_line_are_refused_quietly():
+def test_detections_at_one_place_or_in_a_line_are_refused_quietly():
     for uv in (np.full((6, 2), 700.0), np.stack([np.linspace(200, 2200, 7), np.full(7, 900.0)], axis=1)):
         found = acquire(Detections.from_uv("f", 0, uv))
         assert not answer(found)
@@ -270,7 +270,7 @@ def test_every_pose_of_the_best_names_fits_them(scenario):
     assert seconds > 20 or scenario == "joint"
 
 
-def test_light_of_is_the_inverse_of_a_naming(rng):
+def test_light_of_is_the_inverse_of_an_assignment(rng):
     for _ in range(20):
         n = 15
         name = np.where(rng.random(M) < 0.5, rng.permutation(n)[:M], -1)
@@ -289,6 +289,6 @@ def test_light_of_is_the_inverse_of_a_naming(rng):
         ([-1, -1, -1], [0, 1, 2], False),
     ],
 )
-def test_namings_contradict_where_a_light_or_a_spot_has_two(a, b, expected):
+def test_assignments_contradict_where_a_light_or_a_detection_has_two(a, b, expected):
     a, b = np.array(a), np.array(b)
     assert verify.contradict(a, b) == verify.contradict(b, a) == expected
