@@ -155,7 +155,7 @@ def test_four_lights_that_leave_two_poses_promise_neither():
 
 @pytest.mark.parametrize("seed", [101, 300, 301])
 def test_three_lights_and_clutter_beside_a_fourth_prove_no_pose(seed):
-    """A spurious detection in the gate of a missing light makes a fourth: one frame must not make a valid pose of them."""
+    """A spurious detection in the gate of a missing light makes a fourth: no valid pose may come of one frame."""
     prior = {"roll_deg": 3.0, "pitch_deg": 3.0, "yaw_deg": 3.0}
     config = Config.model_validate({"prior": prior, "match": {"steady": 0.0}})
     localizer = Localizer(STATION, CAMERA, config)

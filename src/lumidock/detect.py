@@ -103,7 +103,17 @@ def seen(frame: Frame, scan: Scan, predicted: Array | None = None) -> Seen | Non
 def _none(frame: Frame) -> Detections:
     nothing = np.empty(0)
     uv, cov = np.empty((0, 2)), np.empty((0, 2, 2))
-    return Detections(frame.name, frame.t_ns, uv, nothing, nothing, nothing, nothing, cov, frame.attitude)
+    return Detections(
+        frame.name,
+        frame.t_ns,
+        uv,
+        radius_px=nothing,
+        flux=nothing,
+        p_light=nothing,
+        p_rear=nothing,
+        cov_px2=cov,
+        attitude=frame.attitude,
+    )
 
 
 def _squared(image: Image, stretch: Array) -> Image:
@@ -202,22 +212,23 @@ def _blobs(views: list[Canvas], patches: Indices, shape: tuple[int, ...], config
                     response,
                     least,
                     noise,
-                    config.roundness,
-                    config.clear,
-                    level,
-                    a,
-                    patches,
-                    first,
-                    last,
-                    found,
-                    count,
+                    roundness=config.roundness,
+                    clear=config.clear,
+                    level=level,
+                    scale=a,
+                    patches=patches,
+                    first=first,
+                    last=last,
+                    found=found,
+                    count=count,
                 )
                 fine = wide
         first = last
     rows = found[:count]
     order = np.argsort(-rows[:, blobs.HEIGHT], kind="stable")
     kept = np.ones(count)
-    groups.strongest(rows, _edge(rows, shape).min(axis=1), order, config.reach, config.wide, config.texture, kept)
+    edge, limits = _edge(rows, shape).min(axis=1), (config.reach, config.wide, config.texture)
+    groups.strongest(rows, edge, order, *limits, kept)
     return _measured(views, patches, rows[order[kept[order] > 0.0]], shape, config)
 
 
@@ -319,7 +330,7 @@ def _one_per_light(found: _Blobs, shape: tuple[int, ...], config: DetectConfig) 
     var = 0.5 * (found.cov[:, 0, 0] + found.cov[:, 1, 1]) + (config.compact * rows[:, blobs.SIZE]) ** 2
     best, partner = np.empty(len(rows) + 1, np.int64), np.empty((len(rows) + 1, 4), np.int64)
     edge = _edge(rows, shape).min(axis=1)
-    count = groups.group(rows, edge, var, order, config.share, config.reach, best, partner)
+    count = groups.group(rows, edge, var, order, share=config.share, reach=config.reach, best=best, partner=partner)
     best, partner = best[: min(count, config.max_lights)], partner[: min(count, config.max_lights)]
     uv, cov = _fused(found, best, partner, config)
     rows = rows[best]
@@ -379,4 +390,14 @@ def _detections(frame: Frame, found: Seen, scan: Scan) -> Detections:
     area = scan.stretch.prod()
     unknown = np.full(len(uv), np.nan)
     radius_px, flux = radius_px / np.sqrt(area), flux / area
-    return Detections(frame.name, frame.t_ns, uv, radius_px, flux, p_light, unknown, cov, frame.attitude)
+    return Detections(
+        frame.name,
+        frame.t_ns,
+        uv,
+        radius_px=radius_px,
+        flux=flux,
+        p_light=p_light,
+        p_rear=unknown,
+        cov_px2=cov,
+        attitude=frame.attitude,
+    )

@@ -202,8 +202,7 @@ def _run(
     tell((*opened.notes, *calibration.warnings))
     warn_if_nothing_is_kept()
     localizer = localizer_of(method, dock, lens, settings, cold=cold)
-    if out.is_dir() and opened.path.is_dir() and out.samefile(opened.path):
-        raise InputError(f"{out}: is the source; write the run elsewhere")
+    _require_another_folder(out, opened.path)
     prepare_folder(out, force)
     left = f"{out} holds a complete row for every frame so far; `run` with --force begins again"
     with (
@@ -221,9 +220,14 @@ def _run(
             progress(next(done), opened.count)
             let_interrupt()
 
-        size = lens.width, lens.height
-        summary = run_source(opened, localizer, folder, setup, on_fix=on_fix, size=size)
+        summary = run_source(opened, localizer, folder, setup, on_fix=on_fix, size=(lens.width, lens.height))
     _print_counts(summary.as_dict(), out, as_json)
+
+
+def _require_another_folder(out: Path, source: Path) -> None:
+    """Raises: InputError where a run would be written into its own source."""
+    if out.is_dir() and source.is_dir() and out.samefile(source):
+        raise InputError(f"{out}: is the source; write the run elsewhere")
 
 
 def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:

@@ -76,19 +76,9 @@ def _design(
         )
         view = DesignView(found.station, rival, judged, rival_judged, alone, confusion, spec.dead, told)
         pages.write(page, design_page(view))
+    figures = {"worst_ratio": float(judged.ratio[worst]), "at_z_m": float(judged.z_m[worst]), "dead": dead}
     if as_json:
-        print(
-            json.dumps(
-                {
-                    "worst_ratio": float(judged.ratio[worst]),
-                    "at_z_m": float(judged.z_m[worst]),
-                    "dead": dead,
-                    "confusion_m": confusion,
-                    "evaluations": found.evaluations,
-                },
-                indent=1,
-            )
-        )
+        print(json.dumps(figures | {"confusion_m": confusion, "evaluations": found.evaluations}, indent=1))
     else:
         print(f"{told}; {found.evaluations} layouts tried; written to {out}")
 

@@ -104,12 +104,11 @@ def _survey(
 
     if check == (out is not None):
         raise InputError("give either --out FILE for a survey, or --check to compare with one")
-    for file in (out, page):
-        if file is not None:
-            require_new(file, force)
-    settings = load_config(config) if config else Config()
     if (station is None) == (lights is None) or (check and station is None):
         raise InputError("give --station FILE, or for a dock of two colours without a drawing --lights F,R")
+    for file in filter(None, (out, page)):
+        require_new(file, force)
+    settings = load_config(config) if config else Config()
     path = shipped_or_path("station", station) if station is not None else cast("Path", out)
     if lights is not None:
         _write_layout(sources, camera, lights, distances or [], path)
@@ -123,9 +122,9 @@ def _survey(
         _write(found, path, out)
     if page is not None:
         _write_page(found, lens, page)
-    if found.refusal and lights is not None:
-        path.unlink()
     if found.refusal:
+        if lights is not None:
+            path.unlink()
         raise InputError(f"survey refused: {found.refusal}")
     if out is None:
         _report_moves(found, drawing, as_json)

@@ -338,7 +338,7 @@ def _conclude(
     S = normal.C - normal.B.reshape(6 * f, s).T @ AB.reshape(6 * f, s)
     S = 0.5 * (S + S.T)
     covariance = np.linalg.inv(S) if calibrate else _considered(S, _calibration_sigma(prior))
-    return Adjusted(at, covariance, line.residual, noise, used, repeats, calibrate)
+    return Adjusted(at, covariance, line.residual, noise, used, repeats=repeats, calibrated=calibrate)
 
 
 def _considered(S: Array, calibration_sigma: Array) -> Array:

@@ -43,7 +43,17 @@ def detections_of_run(folder: Path) -> list[Detections]:
         table = table[np.isfinite(table[:, :2]).all(axis=1)]
         if t_ns.lstrip("-").isdecimal() and len(table):
             sure = np.nan_to_num(table[:, 4], nan=1.0)
-            out.append(Detections(frame, int(t_ns), table[:, :2], table[:, 2], table[:, 3], sure, table[:, 5]))
+            out.append(
+                Detections(
+                    frame,
+                    int(t_ns),
+                    table[:, :2],
+                    radius_px=table[:, 2],
+                    flux=table[:, 3],
+                    p_light=sure,
+                    p_rear=table[:, 5],
+                )
+            )
     return out
 
 

@@ -334,7 +334,7 @@ def _frame_detections(name: str, t_ns: int, rows: list[Row], attitude: Attitude 
         raise FrameError("bad_frame", f"frame {name}: a centre is not a finite number")
     if not all(((p >= 0.0) & (p <= 1.0) | np.isnan(p)).all() for p in (p_light, p_rear)):
         raise FrameError("bad_frame", f"frame {name}: a probability outside 0 to 1")
-    return Detections(name, t_ns, uv, radius_px, flux, p_light, p_rear, attitude=attitude)
+    return Detections(name, t_ns, uv, radius_px=radius_px, flux=flux, p_light=p_light, p_rear=p_rear, attitude=attitude)
 
 
 def _pictures(files: list[Path], stamps: list[int], reading: Reading, size: Size | None) -> Iterator[Item]:

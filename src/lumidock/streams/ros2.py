@@ -232,7 +232,8 @@ def _annotations(fix: Fix, t_ns: int, light_ids: tuple[str, ...]) -> Any:  # noq
         diameter = 2.0 * max(8.0, 1.6 * float(np.nan_to_num(radius)) + 4.0)
         color = green if light >= 0 else red
         at = _make("foxglove_msgs/msg/Point2", float(u), float(v))
-        circles.append(_make("foxglove_msgs/msg/CircleAnnotation", time, at, diameter, 2.0, clear, color))
+        ring = (time, at, diameter, 2.0, clear, color)
+        circles.append(_make("foxglove_msgs/msg/CircleAnnotation", *ring))
         if light >= 0:
             beside = _make("foxglove_msgs/msg/Point2", float(u) + diameter / 2.0 + 2.0, float(v))
             words = (time, beside, light_ids[light], 16.0, color, clear)
