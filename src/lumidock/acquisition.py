@@ -38,6 +38,7 @@ class Moment:
         if hypothesis.n_assigned < POSE_LIGHTS:
             return None
         context, config = self.context, self.context.config
+        declared = track.calibration_prior(context.station, self.attitude)
         return track.start(
             hypothesis,
             self.frame,
@@ -45,7 +46,8 @@ class Moment:
             config.track,
             t_ns=self.t_ns,
             prior=attitude_prior(self.attitude, config.prior),
-            calibration=calibration or track.calibration_prior(context.station, self.attitude),
+            calibration=calibration or declared,
+            declared=declared,
         )
 
 
@@ -95,7 +97,7 @@ def gather(state: LocalizerState, followed: Sequence[Track], found: Acquisition,
     state is `confirmed` where one stands out and passes its test.
     """
     context, config = moment.context, moment.context.config
-    new = [*found.hypotheses, *found.other_poses][: config.track.beliefs]
+    new = [*found.hypotheses, *found.other_poses][: config.track.hypotheses]
     begun = [_renewed(hypothesis, new, followed, moment, state.calibration) for hypothesis in new]
     others = [one for one in followed if not any((one.last.assignment == h.assignment).all() for h in new)]
     tracks = likeliest([*others, *(one for one in begun if one is not None)], context)

@@ -190,7 +190,7 @@ class MatchConfig(Section):
     """Cold start: the evidence and the decision."""
 
     noise_px: PositiveFloat = 0.5  # of a centre that comes without a covariance
-    strange: Fraction = 0.5  # 1 sigma, of its radius, of the centre of a spot that is all but surely no lamp
+    doubtful_share: Fraction = 0.5  # 1 sigma, of its radius, of the centroid of a detection that is surely no lamp
     detect: Annotated[float, Field(gt=0, lt=1)] = 0.8  # probability that a light in view is detected
     layer_absent: Annotated[float, Field(gt=0, lt=1)] = 0.3  # that a layer is not seen at all
     steady: Annotated[float, Field(ge=0, lt=1)] = 0.7  # share of vehicles that hold head-on better than the prior ...
@@ -215,8 +215,6 @@ class MatchConfig(Section):
     margin: PositiveFloat = 6.9  # log odds of the names on one frame, ln 1000
     margin_gathered: PositiveFloat = 9.2  # over frames, or with three lights; of names that one frame alone may prove
     lead: PositiveFloat = 3.5  # log odds by which a naming gathered over frames must lead in the last one alone
-    min_layer: PositiveInt = 3  # fewer lights of a second layer stay unnamed without history: they would set the tilt
-    enough: PositiveInt = 4  # names that let the doubtful ones be dropped
     extra: PositiveFloat = 7.5  # log odds of a name that a lock does not need
     prune: PositiveFloat = 5.0  # log odds below which a single name is dropped in any case
     keep: PositiveFloat = 14.0  # candidates this far below the best are forgotten
@@ -231,15 +229,16 @@ class TrackConfig(Section):
     start_m_s: PositiveFloat = 1.5  # 1 sigma of the unknown twist at the start
     start_rad_s: PositiveFloat = 0.15
     gate: PositiveFloat = 18.4  # chi-square, 2 dof, 1e-4
-    reach: PositiveFloat = 10.0  # log evidence; namings farther behind the best are not followed
-    max_nodes: PositiveInt = 100_000  # of the association's search, 0.1 us each; a belief that wants more is dropped
+    reach: PositiveFloat = 10.0  # log evidence; associations farther behind the best are not followed
+    max_nodes: PositiveInt = 100_000  # of the association's search, 0.1 us each; a track that wants more is dropped
     log_appear: float = -6.9  # log prior that a layer comes into view in one frame
-    joint_lights: PositiveInt = 3  # of each of two layers, before survey and calibration are estimated
+    proven_m: PositiveFloat = 0.01  # a light that all others predict to this, 1 sigma, is proven by geometry: glints
+    # stand 2 cm and more beside the lamps
     max_gap_s: PositiveFloat = 2.0  # without lights; after it only survey and calibration are kept
-    max_surprise: PositiveFloat = 4.0  # of one frame's innovation, as a standard normal deviate
-    max_strain: PositiveFloat = 3.5  # of its running mean
-    strain_memory: Fraction = 0.8  # of that mean, a frame
-    beliefs: PositiveInt = 32  # poses or namings followed side by side
+    max_deviate: PositiveFloat = 4.0  # of one frame's innovation, as a standard normal deviate
+    max_mean_deviate: PositiveFloat = 3.5  # of its running mean
+    deviate_memory: Fraction = 0.8  # of that mean, a frame
+    hypotheses: PositiveInt = 32  # poses or associations followed side by side
     forget: PositiveFloat = 16.0  # log odds at which one is given up
 
 
@@ -247,8 +246,8 @@ class IntegrityConfig(Section):
     """When a pose may be used."""
 
     risk: PositiveFloat = 1e-6  # of a frame
-    fault: PositiveFloat = 1e-5  # prior probability that a named light is wrong; in campaigns of proven tracks 2e-6
-    separate_from: PositiveInt = 6  # lights for one-fault solution separation
+    fault: PositiveFloat = 1e-3  # prior probability that an associated light is wrong, until geometry has proven it
+    fault_proven: PositiveFloat = 2e-6  # afterwards; so often in campaigns of proven tracks
     evidence: PositiveFloat = 13.8  # log odds that stand for the risk, where too few lights can check each other
     carried_frames: PositiveInt = 2  # frames of four lights or more in a row that stand for it as well
     gathered_frames: PositiveInt = 15  # the same for names that no single frame could decide

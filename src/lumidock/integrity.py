@@ -23,6 +23,7 @@ _FAR_SHARE, _FAR_DEG = 0.10, 10.0  # beyond: a share of z, and degrees
 _GUIDE_BEARING_RAD, _GUIDE_RANGE_M, _GUIDE_RANGE_SHARE = math.radians(1.5), 0.3, 0.10  # the contract's
 _ANY_BEARING_RAD = math.sqrt(2.0) * math.pi  # at the origin itself a bearing says nothing ...
 _CLEAR, _STEEP_RAD = 2.0, 0.3  # ... which begins so many range levels away, or with such a bearing level
+_COIN = 0.5  # a level that an error exceeds as often as not is none: no more of the risk is given to a fault
 _IDENTITY = np.eye(4)  # copied: half as long as another
 GUIDE_FROM_M = 3.0  # nearer to the dock's origin, or past it, bearing and range say nothing and the pose decides
 
@@ -63,19 +64,19 @@ class Bounds:
     guide: Guide
 
 
-def bounds(tracks: Sequence[Track], config: IntegrityConfig) -> Bounds:
+def bounds(tracks: Sequence[Track], model: StationModel, config: IntegrityConfig) -> Bounds:
     """Protection of the first hypothesis, wide enough to hold every other that is likelier than the risk.
 
-    Without a fault the levels are factors on sigma; with six or more lights they also hold when any one of them is at
-    fault (M. Joerger et al., "Solution separation versus residual-based RAIM", 2014).
+    Without a fault the levels are factors on sigma; they also hold when any one light has been at fault at any time
+    since the track began (`_kernels.tracking.bank`).
     """
     first = tracks[0]
     cov = np.empty((9, 9))
-    pl = _levels(first, config, cov)
+    pl = _levels(first, model, config, cov)
     for other in tracks[1:]:
         if first.log_weight - other.log_weight < -math.log(config.risk):
             apart = _apart(first, other)
-            wider = apart + np.array(_levels(other, config, np.empty((9, 9))))
+            wider = apart + np.array(_levels(other, model, config, np.empty((9, 9))))
             pl = tuple(np.maximum(pl, wider).tolist())
     T_dock_cam, R_dock_cam, t = _IDENTITY.copy(), first.state.R.T, first.state.t
     T_dock_cam[:3, :3], T_dock_cam[:3, 3] = R_dock_cam, -(R_dock_cam @ t)
@@ -97,13 +98,19 @@ def bounds(tracks: Sequence[Track], config: IntegrityConfig) -> Bounds:
     )
 
 
-def _levels(track: Track, config: IntegrityConfig, cov: Array) -> tuple[float, ...]:
+def _levels(track: Track, model: StationModel, config: IntegrityConfig, cov: Array) -> tuple[float, ...]:
     """Lateral m, axial m, angle rad, bearing rad, range m of one hypothesis; fills `cov` (9, 9)."""
-    last = track.last
-    fault_risk = min(config.risk / (config.fault * max(last.n_used, 1)), 0.5)
-    separate = last.n_used >= config.separate_from
-    factors = SigmaFactors(sigma_factors(config.risk), sigma_factors(fault_risk), separate)
-    return protection_levels(track.state, last.separations, last.plane, factors, cov)
+    factors = fault_factors(int(track.bank.begun[:-1].sum()), config)
+    return protection_levels(track.state, track.last.plane, track.bank, model.planes, factors, cov)
+
+
+def fault_factors(n_lights: int, config: IntegrityConfig) -> SigmaFactors:
+    """The factors with `n_lights` lights that may be at fault, one at a time: they share the risk."""
+
+    def of(prior: float) -> Array:
+        return sigma_factors(min(config.risk / (prior * max(n_lights, 1)), _COIN))
+
+    return SigmaFactors(sigma_factors(config.risk), of(config.fault), of(config.fault_proven))
 
 
 @cache
@@ -171,7 +178,7 @@ def assess(
     first, config = state.first, context.config.integrity
     if status == "coasting" and (reason := _why_no_coasting(first, detections.t_ns, config)):
         return no_fix(state, detections, status, reason), state
-    bound = bounds(state.hypotheses, config)
+    bound = bounds(state.hypotheses, context.model, config)
     proven = is_proven(first, state.margin, config)
     valid, used = proven and pose_holds(bound), first.last.n_used
     now = stage(first, context.model) or state.stage

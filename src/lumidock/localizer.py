@@ -133,7 +133,7 @@ def _shows_two_layers(found: Acquisition, context: Context) -> bool:
     """Whether one frame alone decides on an association with lights enough of two layers."""
     if not verify.is_answer(found, context.config.match):
         return False
-    return sees_two_layers(context.model.count(found.hypotheses[0].assignment), context.config.track)
+    return sees_two_layers(context.model.count(found.hypotheses[0].assignment))
 
 
 def _lost(

@@ -15,7 +15,7 @@ of everything that speaks against it,
 `mirror` holds the prior `log_mirror`; `crowding` is by how much, as a logarithm, unassigned detections stand denser
 around the assigned ones than the evidence's clutter has it. Lights of too small `odds_c` are dropped (`kept`).
 
-    certainty = margin - crowding, and no more than the configured margin where fewer than `enough` lights are each
+    certainty = margin - crowding, and no more than the configured margin where fewer than four lights are each
                 beyond doubt
 
 An answer has four lights and a margin over the configured one (`verify.is_answer`); `certainty` is what later frames
@@ -36,7 +36,7 @@ from lumidock._kernels.measurements import Measurements
 from lumidock.camera import Camera
 from lumidock.config import MatchConfig
 from lumidock.datatypes import Array, Indices
-from lumidock.light_counts import CHECKED_LIGHTS, POSE_LIGHTS
+from lumidock.light_counts import CHECKED_LIGHTS, LAYER_LIGHTS, POSE_LIGHTS
 from lumidock.model import AttitudePrior, StationModel, light_of
 
 _MIRROR = np.array([1.0, -1.0, 1.0])  # the water's surface is level, and so is dock x, z
@@ -129,7 +129,7 @@ def _decided(task: _Search, frame: Measurements, found: Hypotheses, top: Hypothe
     mirror = _mirror_evidence(task, top)
     against = float(np.logaddexp.reduce([-config.log_dock, mirror, *doubt.against[kept >= 0], *conflicting]))
     margin = best - against
-    beyond_doubt = int((odds[kept >= 0] > config.margin_gathered).sum()) >= config.enough
+    beyond_doubt = int((odds[kept >= 0] > config.margin_gathered).sum()) >= CHECKED_LIGHTS
     direct = float(np.logaddexp.reduce([_NONE, *scores[(found.assignments != top.assignment).any(axis=1)]]))
     return Acquisition(
         hypotheses=(replace(top, assignment=kept), *_rest(found, kept, best - config.keep)),
@@ -285,14 +285,14 @@ def _odds(top: Hypothesis, best: float, found: Hypotheses, doubt: Doubt, crowdin
 def _kept(assignment: Indices, odds: Array, task: _Search) -> Indices:
     """The assignment (M,) without what is not beyond doubt: single lights, and layers with too few of them.
 
-    The lights beyond doubt stay; where they are fewer than `enough`, the likeliest of the others fill up.
+    The lights beyond doubt stay; where they are fewer than four, the likeliest of the others fill up.
     """
     config, layer = task.config, task.model.layer
     likeliest = np.sort(odds)[::-1]
-    least = max(min(config.extra, float(likeliest[min(config.enough, len(odds)) - 1])), config.prune)
+    least = max(min(config.extra, float(likeliest[min(CHECKED_LIGHTS, len(odds)) - 1])), config.prune)
     kept = np.where(odds >= least, assignment, -1)
     count = np.bincount(layer[kept >= 0], minlength=task.model.n_layers)
-    weak = (count < config.min_layer) & (count < count.max())
+    weak = (count < LAYER_LIGHTS) & (count < count.max())
     return np.where(weak[layer], -1, kept)
 
 

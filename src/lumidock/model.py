@@ -160,7 +160,7 @@ def measurements(detections: Detections, model: StationModel, config: MatchConfi
     p_light = np.array(detections.p_light, np.float64)
     frame = Measurements(uv, cov, np.empty(n), np.empty((n, model.n_layers)), p_light, 0.0)
     radius_px, p_rear = np.ascontiguousarray(detections.radius_px), np.ascontiguousarray(detections.p_rear)
-    looks = Appearance(config.label_trust, config.strange, _MOST_RADIUS_PX, _P_USUAL)
+    looks = Appearance(config.label_trust, config.doubtful_share, _MOST_RADIUS_PX, _P_USUAL)
     span = weigh(radius_px, p_rear, model.is_rear, looks, frame)
     lens, share = model.lights.lens, config.clutter_near
     whole = lens[6] * lens[7]

@@ -90,7 +90,7 @@ def likeliest(tracks: Sequence[Track], context: Context) -> tuple[Track, ...]:
     config = context.config.track
     ordered = sorted(tracks, key=lambda one: -one.log_weight)
     kept: list[Track] = []
-    for one in ordered[: config.beliefs]:
+    for one in ordered[: config.hypotheses]:
         far_behind = one.log_weight < ordered[0].log_weight - config.forget
         if not far_behind and not any(track.same(one, other) for other in kept):
             kept.append(one)

@@ -15,7 +15,7 @@ from lumidock.track import Track
 
 def innovation_holds(track: Track, config: TrackConfig) -> bool:
     """Whether the last frame's innovation, and that of the frames before, is as large as its covariance allows."""
-    small = track.last.deviate < config.max_surprise and track.mean_deviate < config.max_strain
+    small = track.last.deviate < config.max_deviate and track.mean_deviate < config.max_mean_deviate
     return track.last.n_used > 0 and small
 
 
