@@ -38,7 +38,6 @@ class Moment:
         if hypothesis.n_assigned < POSE_LIGHTS:
             return None
         context, config = self.context, self.context.config
-        declared = track.calibration_prior(context.station, self.attitude)
         return track.start(
             hypothesis,
             self.frame,
@@ -46,8 +45,7 @@ class Moment:
             config.track,
             t_ns=self.t_ns,
             prior=attitude_prior(self.attitude, config.prior),
-            calibration=calibration or declared,
-            declared=declared,
+            calibration=calibration or track.calibration_prior(context.station, self.attitude),
         )
 
 

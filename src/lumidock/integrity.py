@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from lumidock._kernels.tracking.levels import SigmaFactors, protection_levels
+from lumidock._kernels.tracking.levels import Groups, SigmaFactors, protection_levels
 from lumidock.config import IntegrityConfig
 from lumidock.datatypes import Array, Detections, Fix, Guide, Match, Protection, Stage, Status
 from lumidock.model import StationModel, light_of
@@ -100,8 +100,8 @@ def bounds(tracks: Sequence[Track], model: StationModel, config: IntegrityConfig
 
 def _levels(track: Track, model: StationModel, config: IntegrityConfig, cov: Array) -> tuple[float, ...]:
     """Lateral m, axial m, angle rad, bearing rad, range m of one hypothesis; fills `cov` (9, 9)."""
-    factors = fault_factors(int(track.bank.begun[:-1].sum()), config)
-    return protection_levels(track.state, track.last.plane, track.bank, model.planes, factors, cov)
+    factors = fault_factors(int(track.bank.used.sum()), config)
+    return protection_levels(track.state, track.last.plane, track.bank, Groups(model.group, model.planes), factors, cov)
 
 
 def fault_factors(n_lights: int, config: IntegrityConfig) -> SigmaFactors:

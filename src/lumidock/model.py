@@ -13,6 +13,7 @@ from lumidock._kernels.tracking.track import Lights
 from lumidock.camera import Camera
 from lumidock.config import MatchConfig, PriorConfig
 from lumidock.datatypes import Array, Attitude, Detections, Indices
+from lumidock.light_counts import MAX_SUBSETS
 from lumidock.station import Station
 
 _HEAD_ON = np.diag([1.0, -1.0, -1.0])  # R_dock_cam of a camera that looks straight into the dock
@@ -39,6 +40,7 @@ class StationModel:
     """A station of M lights in L layers and the camera that sees it.
 
     `lights`: lens, positions m and beam axes. `layer` (M,) of each light; `is_rear` (L,) 1 for the rearmost layer.
+    `group` (M,): the light, or the group of many, that one state of the bank is blind to.
     `survey_m2` (M,): variance m^2 of a position against the front layer. `planes` (L, 6): a point and the normal of
     each layer's plane, NaN for a layer with depth. `log_volume`: log of the volume m^3 of the view cone.
     `sigma_focal`: relative 1-sigma error of the focal length.
@@ -48,6 +50,7 @@ class StationModel:
     layer: Indices
     n_layers: int
     is_rear: Indices
+    group: Indices
     survey_m2: Array
     order: PairOrder
     planes: Array
@@ -85,6 +88,7 @@ def station_model(station: Station, camera: Camera, config: MatchConfig) -> Stat
         layer=station.layer,
         n_layers=len(station.layers),
         is_rear=(behind == len(front_first) - 1).astype(np.int64),
+        group=np.arange(len(station)) % MAX_SUBSETS,
         survey_m2=station.sigma_light_m**2 + (behind > 0)[station.layer] * 2.0 * station.sigma_layer_m**2,
         order=_pair_order(station),
         planes=_planes(station),

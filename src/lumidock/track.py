@@ -142,25 +142,19 @@ def learned_calibration(track: Track) -> CalibrationStates:
     return CalibrationStates(x, P)
 
 
-def open_bank(P: Array, considered: Array, n_lights: int) -> Bank:
-    """A bank for `n_lights` lights that begins with the filter's own prior `P` (n, n), and considers the files'."""
-    S, rows = n_lights + 1, np.ascontiguousarray(P[: bank_kernel.MOVING])
-    begun = np.zeros(S, np.int64)
-    begun[-1] = 1
-    return Bank(
-        np.zeros((S, bank_kernel.MOVING)),
-        np.tile(rows, (S, 1, 1)),
-        considered,
-        begun,
-        np.full(S, -1, np.int64),
-        np.zeros(n_lights, np.int64),
-        np.zeros(n_lights, np.int64),
-    )
+def open_bank(model: StationModel) -> Bank:
+    """A bank in which no subset has begun."""
+    S, m, n = int(model.group.max()) + 1, len(model), kernel.LIGHTS + 3 * len(model)
+    none, nobody = np.full(S, -1, np.int64), np.zeros(m, np.int64)
+    return Bank(np.zeros((S, n)), np.empty((S, n, n)), np.zeros(S, np.int64), none, nobody, nobody, nobody)
 
 
 def _copied(bank: Bank) -> Bank:
-    """The same bank in arrays of its own; what it considers never changes."""
-    return Bank(*(values if values is bank.considered else values.copy() for values in bank))
+    """The same bank in arrays of its own; what has not begun takes no time."""
+    offset, P, *flags = bank
+    copied_P, begun = np.empty_like(P), np.flatnonzero(bank.begun)
+    copied_P[begun] = P[begun]
+    return Bank(offset.copy(), copied_P, *(values.copy() for values in flags))
 
 
 def open_states(calibration: CalibrationStates, config: TrackConfig) -> tuple[Array, Array]:
@@ -180,20 +174,17 @@ def start(
     t_ns: int,
     prior: AttitudePrior,
     calibration: CalibrationStates,
-    declared: CalibrationStates,
 ) -> Track | None:
     """A track from one frame's hypothesis; None where its lights do not hold together.
-
-    `calibration`: what is known of survey and calibration; `declared`: what the files say, which no fault has touched.
 
     Where all lights are of one plane, it is linearised ever flatter until the tilt's covariance grows no more.
     """
     x, P = open_states(calibration, config)
     state = FilterState(hypothesis.R.copy(), hypothesis.t.copy(), x, P)
     kernel.attitude_update(state, prior.R_dock_cam, 1.0 / prior.info, prior.measured)
-    bank = open_bank(state.P, declared.P, len(model))
     never = LastSeen(t_ns, _NEVER, (_NEVER,) * model.n_layers)
-    fresh = Track(t_ns, t_ns, state, bank, never, FrameResult.nothing(model), log_weight=hypothesis.log_evidence)
+    nothing = FrameResult.nothing(model)
+    fresh = Track(t_ns, t_ns, state, open_bank(model), never, nothing, log_weight=hypothesis.log_evidence)
     first = _Start(hypothesis.R, hypothesis.t, None)
     begun = _update(fresh, hypothesis.assignment, frame, model, config, guess=first)
     for _ in range(_MAX_FLATTENINGS):
@@ -338,13 +329,16 @@ def _bank_updated(
     """The updated track with its bank updated too, which is still that of the track `before`."""
     bank, seen = _copied(before.bank), Assigned(after.last.assignment, frame.uv, frame.cov)
     rules = BankRules(
+        group=model.group,
         layer=model.layer,
         planes=model.planes,
+        estimated=len(after.state.x) if after.estimates_calibration else kernel.CALIBRATION,
         depth_known=after.estimates_calibration,
         starting=starting,
         turn_cov=after.state.P[3:6, 3:6].copy(),
         proven_m=config.proven_m,
     )
+    bank_kernel.begin_subsets(bank, before.state, after.last.assignment, model.group)
     bank_kernel.shift_bank(bank, before.state, after.state)
     bank_kernel.update_bank(model.lights, after.state, seen, rules, bank)
     return replace(after, bank=bank)

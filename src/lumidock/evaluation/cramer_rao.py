@@ -12,8 +12,8 @@ import numpy as np
 
 from lumidock import track
 from lumidock._kernels.tracking import track as kernel
-from lumidock._kernels.tracking.bank import BankRules, predict_bank, update_bank
-from lumidock._kernels.tracking.levels import protection_levels
+from lumidock._kernels.tracking.bank import BankRules, begin_subsets, predict_bank, update_bank
+from lumidock._kernels.tracking.levels import Groups, protection_levels
 from lumidock._kernels.tracking.track import FilterState
 from lumidock._kernels.tracking.update import Assigned, UpdateRules, update
 from lumidock.camera import Camera
@@ -68,9 +68,14 @@ class Bound:
             return None
         if t_ns - self._agreed_ns > self.config.track.max_gap_s * 1e9:
             return None  # three lights fit many poses
-        factors = fault_factors(int(self._bank.begun[:-1].sum()), self.config.integrity)
+        factors = fault_factors(int(self._bank.used.sum()), self.config.integrity)
         levels = protection_levels(
-            self._at(R, t), track.NO_PLANE, self._bank, self._no_planes, factors, np.empty((9, 9))
+            self._at(R, t),
+            track.NO_PLANE,
+            self._bank,
+            Groups(self._model.group, self._no_planes),
+            factors,
+            np.empty((9, 9)),
         )
         return np.array(levels[:3])
 
@@ -92,7 +97,7 @@ class Bound:
         x, P = track.open_states(self._declared, self.config.track)
         state = FilterState(R.copy(), t.copy(), x, P)
         kernel.attitude_update(state, self._prior.R_dock_cam, 1.0 / self._prior.info, False)
-        self._bank = track.open_bank(P, self._declared.P, len(self.station))
+        self._bank = track.open_bank(self._model)
         return P
 
     def _predict(self, R: Array, t: Array, dt: float) -> None:
@@ -123,10 +128,13 @@ class Bound:
             turn_cov=np.eye(3),
         )
         seen = Assigned(assignment, uv, cov)
+        begin_subsets(self._bank, state, assignment, self._model.group)
         update(self._model.lights, self._at(R, t), state, seen, rules)
         bank_rules = BankRules(
+            group=self._model.group,
             layer=self._model.layer,
             planes=self._no_planes,
+            estimated=rules.estimated,
             depth_known=True,
             starting=False,
             turn_cov=np.eye(3),

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from lumidock._kernels.compiling import entry, part
-from lumidock._kernels.tracking.bank import Bank
+from lumidock._kernels.tracking.bank import Bank, all_proven
 from lumidock._kernels.tracking.slant import tilt_of
 from lumidock._kernels.tracking.track import FilterState
-from lumidock.datatypes import Array
+from lumidock.datatypes import Array, Indices
 
 _TILT_SIGMAS = 2.5  # of a plane's tilt, for what its square does to the range
 
@@ -25,6 +25,13 @@ class SigmaFactors(NamedTuple):
     fault_free: Array
     unproven: Array
     proven: Array
+
+
+class Groups(NamedTuple):
+    """The subset that is blind to each light, `group` (M,), and the `planes` (L, 6) of the layers."""
+
+    group: Indices
+    planes: Array
 
 
 @part
@@ -72,26 +79,27 @@ def _largest3(A: Array) -> float:
 
 @entry
 def protection_levels(
-    state: FilterState, plane: Array, bank: Bank, planes: Array, factors: SigmaFactors, cov: Array
+    state: FilterState, plane: Array, bank: Bank, groups: Groups, factors: SigmaFactors, cov: Array
 ) -> tuple[float, float, float, float, float]:
     """Protection levels: lateral m, axial m, angle rad, bearing rad, range m; `cov` (9, 9) of `outputs` is filled.
 
     The filter's own, on the `plane` (6,) of its last lights, and that of every state of the `bank` that is blind to a
-    light: how far it is off the filter and what it may be off itself. `planes` (L, 6) are those of the layers.
+    light: how far it is off the filter and what it may be off itself.
     """
     C = outputs(state.R, state.t)
     level, other, apart, theirs = np.zeros(5), np.empty(5), np.zeros(9), np.empty((9, 9))
     nowhere = np.full(6, np.nan)
     _levels(state, C, state.P, plane, apart, factors.fault_free, cov, level)
-    for c in range(len(bank.proven)):
-        if bank.begun[c] == 0:
+    for s in range(len(bank.begun)):
+        if bank.begun[s] == 0:
             continue
         for i in range(9):
             apart[i] = 0.0
             for k in range(6):
-                apart[i] += C[i, k] * bank.offset[c, k]
-        flat = planes[bank.plane[c]] if bank.plane[c] >= 0 else nowhere
-        _levels(state, C, bank.P[c], flat, apart, factors.proven if bank.proven[c] else factors.unproven, theirs, other)
+                apart[i] += C[i, k] * bank.offset[s, k]
+        flat = groups.planes[bank.plane[s]] if bank.plane[s] >= 0 else nowhere
+        k_fault = factors.proven if all_proven(bank, groups.group, s) else factors.unproven
+        _levels(state, C, bank.P[s], flat, apart, k_fault, theirs, other)
         for i in range(5):
             level[i] = max(level[i], other[i])
     return level[0], level[1], level[2], level[3], level[4]

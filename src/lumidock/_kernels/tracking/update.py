@@ -56,9 +56,7 @@ class _Rows(NamedTuple):
 
 
 @entry
-def update(
-    station: Lights, predicted: FilterState, state: FilterState, seen: Assigned, rules: UpdateRules
-) -> float:
+def update(station: Lights, predicted: FilterState, state: FilterState, seen: Assigned, rules: UpdateRules) -> float:
     """Update `state` by all assigned detections at once, in place; the NIS, NaN on failure.
 
     The pose of `predicted` is the one that `P` belongs to, that of `state` where to linearise first. Seen at a slant by
@@ -110,7 +108,7 @@ def update(
         if not _whiten(station, flat, seen, rows):
             return np.nan
         whiten_innovation(rows.Z, nu, w)
-    _shrink(P, rows.G, estimated)
+    shrink(P, rows.G, estimated)
     return square
 
 
@@ -187,7 +185,7 @@ def whiten_innovation(Z: Array, nu: Array, w: Array) -> None:
 
 
 @part
-def _shrink(P: Array, G: Array, estimated: int) -> None:
+def shrink(P: Array, G: Array, estimated: int) -> None:
     """Take the information of an update out of `P` (n, n), but not from what is only considered; `G` (2 m, n)."""
     for i in range(len(P)):
         end = i + 1 if i < estimated else estimated
