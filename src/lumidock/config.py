@@ -251,6 +251,7 @@ class IntegrityConfig(Section):
     evidence: PositiveFloat = 13.8  # log odds that stand for the risk, where too few lights can check each other
     carried_frames: PositiveInt = 2  # frames of four lights or more in a row that stand for it as well
     gathered_frames: PositiveInt = 15  # the same for names that no single frame could decide
+    thin_frames: PositiveInt = 3  # in a row held by fewer than four lights, after which a fresh acquisition must agree
     max_age_s: PositiveFloat = 0.3  # of the last light
 
 

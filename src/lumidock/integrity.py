@@ -15,7 +15,7 @@ from lumidock.datatypes import Array, Detections, Fix, Guide, Match, Protection,
 from lumidock.model import StationModel, light_of
 from lumidock.state import Context, LocalizerState
 from lumidock.track import Track
-from lumidock.verify import is_proven
+from lumidock.verify import contradict, contradicted_file, is_proven
 
 # default alert limits: below this z m, metres for the lateral and the axial error each, degrees of rotation
 _NEAR_LIMITS = ((1.5, 0.3, 5.0), (5.0, 0.5, 5.0), (12.0, 1.0, 8.0))
@@ -179,8 +179,8 @@ def assess(
     if status == "coasting" and (reason := _why_no_coasting(first, detections.t_ns, config)):
         return no_fix(state, detections, status, reason), state
     bound = bounds(state.hypotheses, context.model, config)
-    proven = is_proven(first, state.margin, config)
-    valid, used = proven and pose_holds(bound), first.last.n_used
+    doubt = _doubt(state, context)
+    valid, used = not doubt and pose_holds(bound), first.last.n_used
     now = stage(first, context.model) or state.stage
     state = state if now == state.stage else replace(state, stage=now)
     fix = Fix(
@@ -191,14 +191,25 @@ def assess(
         n_seen=len(detections),
         n_used=used,
         T_dock_cam=bound.T_dock_cam if valid else None,
-        reason="" if valid else "protection" if proven else "ambiguous",
+        reason="" if valid else doubt or "protection",
         match=Match(detections, light_of(first.last.assignment, len(detections))),
         covariance=bound.covariance if valid else None,
         protection=bound.protection if valid else None,
-        guide=bound.guide if proven and guide_holds(bound) else None,
+        guide=bound.guide if not doubt and guide_holds(bound) else None,
         nis=first.last.nis / (2 * used) if status == "tracking" else math.nan,
     )
     return fix, state
+
+
+def _doubt(state: LocalizerState, context: Context) -> str:
+    """The word for a track that no level makes valid: another fits too, it is not proven, or the files are wrong."""
+    first, config = state.first, context.config.integrity
+    if not is_proven(first, state.margin, config):
+        rivals = state.hypotheses[1:]
+        return "ambiguous" if any(contradict(first.last.assignment, r.last.assignment) for r in rivals) else "unproven"
+    if state.thin_frames >= config.thin_frames:
+        return "unproven"
+    return contradicted_file(first, context.prior_var)[0]
 
 
 def _why_no_coasting(first: Track, t_ns: int, config: IntegrityConfig) -> str:

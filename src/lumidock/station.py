@@ -28,7 +28,7 @@ class Station:
 
     `p_dock` (N, 3) m; `layer` (N,) index into `layers`; `axis` (N, 3) unit vectors out of the lamps; `beam_deg` (N,)
     full angle at half intensity; `power_w` (N,) radiant power; `docking_point` (3,) m where the camera must end.
-    Sigmas are 1-sigma survey and calibration errors.
+    Sigmas are 1-sigma survey and calibration errors. `dock_exclusive`: no other dock of this layout is ever in view.
     """
 
     name: str
@@ -45,6 +45,7 @@ class Station:
     sigma_layer_m: float
     sigma_focal: float
     sigma_center_px: float
+    dock_exclusive: bool = True
 
     def __post_init__(self) -> None:
         n = len(self.ids)
@@ -105,6 +106,7 @@ class _StationFile(_Strict):
     name: Annotated[str, Field(min_length=1, max_length=64)]
     frame: Literal["dock"] = "dock"
     docking_point: Vector = (0.0, 0.0, 0.0)
+    dock_exclusive: bool = True
     survey_sigma: _SurveySigma = _SurveySigma()
     calibration_sigma: _CalibrationSigma = _CalibrationSigma()
     lights: list[_Light]
@@ -153,4 +155,5 @@ def load_station(path: Path) -> Station:
         sigma_layer_m=content.survey_sigma.layer_m,
         sigma_focal=content.calibration_sigma.focal,
         sigma_center_px=content.calibration_sigma.center_px,
+        dock_exclusive=content.dock_exclusive,
     )

@@ -58,7 +58,8 @@ class FrameResult:
     """What the last frame did to a track.
 
     `assignment` (M,): the detection of each light or -1; `count`: lights with one by layer. `plane` (6,): the
-    one that all of them lie on, NaN where none. `nis`: normalised innovation squared; `deviate`: the same as a standard normal deviate.
+    one that all of them lie on, NaN where none. `nis`: normalised innovation squared; `deviate`: the same as a standard
+    normal deviate.
     """
 
     assignment: Indices
@@ -259,11 +260,11 @@ def associate(
 
     `predicted`: what `predict_measurements` said of this track, where it has been asked.
 
-    A layer that was not in view enters with three lights or more, or not at all: where the tilt is open, clutter in the
-    wide gate of a single light would set it.
+    A layer that was not in view lately, for `max_age_s`, enters with three lights or more, or not at all: where the
+    tilt is open, clutter in the wide gate of a single light would set it.
     """
     predicted = predicted or predict_measurements(track, model)
-    lately = [track.t_ns - t_ns <= config.track.max_gap_s * 1e9 for t_ns in track.seen.layer_ns]
+    lately = [track.t_ns - t_ns <= config.integrity.max_age_s * 1e9 for t_ns in track.seen.layer_ns]
     if all(lately):
         return _associate(predicted, frame, model, config)
     known = np.array(lately)[model.layer]

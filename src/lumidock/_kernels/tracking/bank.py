@@ -246,7 +246,7 @@ def _update_flattened(
     work: _Work,
     bank: Bank,
 ) -> None:
-    """Update one subset that sees a single plane; at a start ever flatter, until its tilt's covariance grows no more."""
+    """Update one subset that sees a single plane; at a start ever flatter until its tilt's covariance grows no more."""
     turn_cov, first, P = np.empty((3, 3)), bank.offset[s].copy(), bank.P[s].copy()
     for i in range(3):
         for j in range(3):

@@ -13,7 +13,7 @@ from lumidock._kernels.tracking.slant import tilt_of
 from lumidock._kernels.tracking.track import FilterState
 from lumidock.datatypes import Array, Indices
 
-_TILT_SIGMAS = 2.5  # of a plane's tilt, for what its square does to the range
+_TILT_SHARE = 0.51  # of the factor on sigma, for what the square of a plane's tilt does to the range: 2.5 sigma at 1e-6
 
 
 class SigmaFactors(NamedTuple):
@@ -135,7 +135,7 @@ def _levels(
     if not math.isnan(plane[0]):
         q, axis = np.empty(3), np.empty(3)
         tilt, sigma = tilt_of(state.R, state.t, plane, P[3:6, 3:6].copy(), q, axis)
-        far = tilt + _TILT_SIGMAS * sigma
+        far = tilt + _TILT_SHARE * k[0] * sigma
         shrunk = 0.25 * (far * far - tilt * tilt) * math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
         level[1] += shrunk
         level[4] += shrunk
