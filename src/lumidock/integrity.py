@@ -100,6 +100,9 @@ def bounds(tracks: Sequence[Track], model: StationModel, config: IntegrityConfig
 
 def _levels(track: Track, model: StationModel, config: IntegrityConfig, cov: Array) -> tuple[float, ...]:
     """Lateral m, axial m, angle rad, bearing rad, range m of one hypothesis; fills `cov` (9, 9)."""
+    begun = track.bank.begun == 1
+    if not math.isfinite(float(track.bank.P[begun, :6, :6].sum() + track.bank.offset[begun].sum())):
+        return (math.inf,) * 5  # a light that cannot be left out leaves no level
     factors = fault_factors(int(track.bank.used.sum()), config)
     return protection_levels(track.state, track.last.plane, track.bank, Groups(model.group, model.planes), factors, cov)
 
