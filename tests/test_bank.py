@@ -79,7 +79,11 @@ def test_a_light_that_is_used_late_is_left_out_from_then_on(rng):
     both = track.update(later, own(BOTH), measured(history[-1][1]), MODEL, CONFIG.track)
     T_cam_dock, _ = blind(both, 7)
     less = track.update(
-        track.predict(one, 5 * STEP_NS, CONFIG.track), own(BOTH[BOTH != 7]), measured(history[-1][1]), MODEL, CONFIG.track
+        track.predict(one, 5 * STEP_NS, CONFIG.track),
+        own(BOTH[BOTH != 7]),
+        measured(history[-1][1]),
+        MODEL,
+        CONFIG.track,
     )
     apart = claims.pose_error(se3_inverse(T_cam_dock), se3_inverse(less.T_cam_dock))
     assert np.linalg.norm(apart / np.sqrt(np.diagonal(in_dock(less)))) < 0.35

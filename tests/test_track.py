@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from conftest import assert_close, called, numeric_jacobian
+from conftest import assert_close, numeric_jacobian
 from numpy.testing import assert_array_equal
 from tracks import (
     BOTH,
@@ -28,10 +28,9 @@ from tracks import (
 
 from lumidock import integrity, track
 from lumidock._kernels.tracking import track as kernel
-from lumidock._kernels.tracking.levels import outputs
 from lumidock.datatypes import Attitude
 from lumidock.evaluation import claims
-from lumidock.geometry import bearing_and_range, se3_adjoint, se3_exp, se3_inverse, so3_exp, so3_log
+from lumidock.geometry import se3_adjoint, se3_exp, se3_inverse, so3_exp, so3_log
 from lumidock.localizer import Localizer
 from lumidock.model import measurements
 

@@ -10,6 +10,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeIn
 from lumidock.yamlfile import read_mapping, validate
 
 PositiveFloat = Annotated[float, Field(ge=1e-12, le=1e9)]  # its square, and one over that, are numbers too
+Risk = Annotated[float, Field(ge=1e-12, le=1e-2)]  # a larger one protects nothing, a smaller one no normal tail backs
+Age = Annotated[float, Field(gt=0.0, le=5.0)]  # s; after it the vehicle's motion is anyone's guess
+NoisePx = Annotated[float, Field(ge=0.05, le=100.0)]  # no detector is better than a twentieth of a pixel
+Pairs = Annotated[int, Field(ge=1, le=10_000_000)]  # 15 s of search
+Hypotheses = Annotated[int, Field(ge=1, le=256)]  # each holds a bank of covariances, 0.4 MB with 13 lights
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Hue = Annotated[int, Field(ge=0, le=179)]
 Effort = Annotated[int, Field(ge=1, le=10_000)]
@@ -189,7 +194,7 @@ class PriorConfig(Section):
 class MatchConfig(Section):
     """Cold start: the evidence and the decision."""
 
-    noise_px: PositiveFloat = 0.5  # of a centre that comes without a covariance
+    noise_px: NoisePx = 0.5  # of a centre that comes without a covariance
     doubtful_share: Fraction = 0.5  # 1 sigma, of its radius, of the centroid of a detection that is surely no lamp
     detect: Annotated[float, Field(gt=0, lt=1)] = 0.8  # probability that a light in view is detected
     layer_absent: Annotated[float, Field(gt=0, lt=1)] = 0.3  # that a layer is not seen at all
@@ -205,10 +210,10 @@ class MatchConfig(Section):
     roll_gate: PositiveFloat = 3.3  # sigma of the prior
     near_m: PositiveFloat = 0.3
     far_m: PositiveFloat = 40.0  # of a light
-    hypotheses: PositiveInt = 64
+    hypotheses: Hypotheses = 64
     least_detections: PositiveInt = 16  # of more detections only the likeliest lamps are looked at, ...
     detections_per_light: PositiveInt = 2  # ... so many, or this times the station's lights
-    max_pairs: PositiveInt = 40_000  # pairs looked at in a frame, some 1.5 us each; a frame that wants more is refused
+    max_pairs: Pairs = 40_000  # pairs looked at in a frame, some 1.5 us each; a frame that wants more is refused
     log_dock: float = 2.0  # log prior odds that the dock is in view at all
     max_detections_three: PositiveInt = 14  # among more, three lights of a layer say nothing
     sure: PositiveFloat = 15.0  # log evidence above which three lights of each layer need not be looked for
@@ -224,35 +229,49 @@ class MatchConfig(Section):
 class TrackConfig(Section):
     """The filter with history."""
 
-    accel_m_s2: PositiveFloat = 0.3  # white noise on the twist: what a second adds to it, 1 sigma
-    accel_rad_s2: PositiveFloat = 0.05
+    accel_m_s2: Annotated[float, Field(ge=0.01, le=100.0)] = (
+        0.3  # white noise on the twist: what a second adds to it, 1 sigma
+    )
+    accel_rad_s2: Annotated[float, Field(ge=0.002, le=100.0)] = 0.05
     start_m_s: PositiveFloat = 1.5  # 1 sigma of the unknown twist at the start
     start_rad_s: PositiveFloat = 0.15
     gate: PositiveFloat = 18.4  # chi-square, 2 dof, 1e-4
     reach: PositiveFloat = 10.0  # log evidence; associations farther behind the best are not followed
-    max_nodes: PositiveInt = 100_000  # of the association's search, 0.1 us each; a track that wants more is dropped
+    max_nodes: Pairs = 100_000  # of the association's search, 0.1 us each; a track that wants more is dropped
     log_appear: float = -6.9  # log prior that a layer comes into view in one frame
-    proven_m: PositiveFloat = 0.01  # a light that all others predict to this, 1 sigma, is proven by geometry: glints
+    proven_m: Annotated[float, Field(ge=1e-6, le=0.05)] = (
+        0.01  # a light that all others predict to this, 1 sigma, is proven by geometry: glints
+    )
     # stand 2 cm and more beside the lamps
-    max_gap_s: PositiveFloat = 2.0  # without lights; after it only survey and calibration are kept
-    max_deviate: PositiveFloat = 4.0  # of one frame's innovation, as a standard normal deviate
-    max_mean_deviate: PositiveFloat = 3.5  # of its running mean
+    max_gap_s: Age = 2.0  # without lights; after it only survey and calibration are kept
+    max_deviate: Annotated[float, Field(ge=2.0, le=8.0)] = (
+        4.0  # of one frame's innovation, as a standard normal deviate
+    )
+    max_mean_deviate: Annotated[float, Field(ge=2.0, le=8.0)] = 3.5  # of its running mean
     deviate_memory: Fraction = 0.8  # of that mean, a frame
-    hypotheses: PositiveInt = 32  # poses or associations followed side by side
+    hypotheses: Hypotheses = 32  # poses or associations followed side by side
     forget: PositiveFloat = 16.0  # log odds at which one is given up
 
 
 class IntegrityConfig(Section):
     """When a pose may be used."""
 
-    risk: PositiveFloat = 1e-6  # of a frame
-    fault: PositiveFloat = 1e-3  # prior probability that an associated light is wrong, until geometry has proven it
-    fault_proven: PositiveFloat = 2e-6  # afterwards; so often in campaigns of proven tracks
-    evidence: PositiveFloat = 13.8  # log odds that stand for the risk, where too few lights can check each other
-    carried_frames: PositiveInt = 2  # frames of four lights or more in a row that stand for it as well
+    risk: Risk = 1e-6  # of a frame
+    fault: Annotated[float, Field(ge=1e-6, le=0.1)] = (
+        1e-3  # prior probability that an associated light is wrong, until geometry has proven it
+    )
+    fault_proven: Annotated[float, Field(ge=1e-7, le=0.1)] = 2e-6  # afterwards; so often in campaigns of proven tracks
+    evidence: Annotated[float, Field(ge=4.6, le=1e3)] = (
+        13.8  # log odds that stand for the risk, where too few lights can check each other
+    )
+    carried_frames: Annotated[int, Field(ge=2, le=10_000)] = (
+        2  # frames of four lights or more in a row that stand for it as well
+    )
     gathered_frames: PositiveInt = 15  # the same for names that no single frame could decide
-    thin_frames: PositiveInt = 3  # in a row held by fewer than four lights, after which a fresh acquisition must agree
-    max_age_s: PositiveFloat = 0.3  # of the last light
+    thin_frames: Annotated[int, Field(ge=1, le=30)] = (
+        3  # in a row held by fewer than four lights, after which a fresh acquisition must agree
+    )
+    max_age_s: Age = 0.3  # of the last light
 
 
 class Config(Section):

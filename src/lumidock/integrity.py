@@ -11,7 +11,8 @@ import numpy as np
 
 from lumidock._kernels.tracking.levels import Groups, SigmaFactors, protection_levels
 from lumidock.config import IntegrityConfig
-from lumidock.datatypes import Array, Detections, Fix, Guide, Match, Protection, Stage, Status
+from lumidock.datatypes import Alternative, Array, Detections, Fix, Guide, Match, Protection, Stage, Status
+from lumidock.geometry import se3_inverse
 from lumidock.model import StationModel, light_of
 from lumidock.state import Context, LocalizerState
 from lumidock.track import Track
@@ -25,6 +26,7 @@ _ANY_BEARING_RAD = math.sqrt(2.0) * math.pi  # at the origin itself a bearing sa
 _CLEAR, _STEEP_RAD = 2.0, 0.3  # ... which begins so many range levels away, or with such a bearing level
 _COIN = 0.5  # a level that an error exceeds as often as not is none: no more of the risk is given to a fault
 _IDENTITY = np.eye(4)  # copied: half as long as another
+_OPEN = ("ambiguous", "unproven")  # reasons with which the poses that fit are told
 GUIDE_FROM_M = 3.0  # nearer to the dock's origin, or past it, bearing and range say nothing and the pose decides
 
 
@@ -200,8 +202,18 @@ def assess(
         protection=bound.protection if valid else None,
         guide=bound.guide if not doubt and guide_holds(bound) else None,
         nis=first.last.nis / (2 * used) if status == "tracking" else math.nan,
+        alternatives=alternatives(state.hypotheses) if doubt in _OPEN else (),
     )
     return fix, state
+
+
+def alternatives(tracks: Sequence[Track]) -> tuple[Alternative, ...]:
+    """The poses that hypotheses hold possible, with their probabilities among them."""
+    if not tracks:
+        return ()
+    share = np.exp(np.array([one.log_weight for one in tracks]) - tracks[0].log_weight)
+    share /= share.sum()
+    return tuple(Alternative(float(p), se3_inverse(one.T_cam_dock)) for p, one in zip(share, tracks, strict=True))
 
 
 def _doubt(state: LocalizerState, context: Context) -> str:
@@ -210,6 +222,8 @@ def _doubt(state: LocalizerState, context: Context) -> str:
     if not is_proven(first, state.margin, config):
         rivals = state.hypotheses[1:]
         return "ambiguous" if any(contradict(first.last.assignment, r.last.assignment) for r in rivals) else "unproven"
+    if state.twin:
+        return "ambiguous"
     if state.thin_frames >= config.thin_frames:
         return "unproven"
     return contradicted_file(first, context.prior_var)[0]
@@ -229,4 +243,5 @@ def no_fix(state: LocalizerState, detections: Detections, status: Status, reason
     """The answer to a frame that gives no pose, and why."""
     spurious = Match(detections, np.full(len(detections), -1, np.int64))
     frame, t_ns, seen = detections.frame, detections.t_ns, len(detections)
-    return Fix(frame, t_ns, status, state.stage, n_seen=seen, reason=reason, match=spurious)
+    poses = alternatives(state.hypotheses) if reason in _OPEN else ()
+    return Fix(frame, t_ns, status, state.stage, n_seen=seen, reason=reason, match=spurious, alternatives=poses)

@@ -138,6 +138,7 @@ def _checked(state: LocalizerState, moment: Moment) -> LocalizerState:
     config, used = moment.context.config, state.first.last.n_used
     if used < CHECKED_LIGHTS:
         return replace(state, thin_frames=state.thin_frames + 1)
+    state = replace(state, twin=moment.shows_twin(state.first.last.assignment))
     if state.thin_frames < config.integrity.thin_frames:
         return replace(state, thin_frames=0)
     found = moment.acquire(all_mirrors=True)
@@ -182,7 +183,10 @@ def _acquired(
 ) -> tuple[Fix, LocalizerState]:
     """What an acquisition gives: a track confirmed by this frame, or by several; else coasting, or no fix."""
     context = moment.context
-    if verify.is_answer(found, context.config.match):
+    answer = verify.is_answer(found, context.config.match)
+    if answer and moment.shows_twin(found.hypotheses[0].assignment):
+        return integrity.no_fix(state, detections, "none", "ambiguous"), replace(state, confirmed=False, hypotheses=())
+    if answer:
         state, confirmed = acquisition.confirm(state, found, moment, still_held)
         if confirmed:
             return integrity.assess(state, detections, "acquired", context)

@@ -42,7 +42,8 @@ class LocalizerState:
     `hypotheses`: poses held possible, the likeliest first; before the track is `confirmed` they may differ in their
     assignments. `margin`: log odds of the assignment, from the frame that confirmed it, 0 where no single frame could.
     `thin_frames`: frames in a row, up to the last that was checked, in which fewer than four lights held the track.
-    `frozen`: the last frame was the picture before it again. `failures`: frames since the first hypothesis last held. `stage`: docking stage of the last fix. `last`: detections
+    `twin`: another array of the same layout was in view. `frozen`: the last frame was the picture before it again.
+    `failures`: frames since the first hypothesis last held. `stage`: docking stage of the last fix. `last`: detections
     of the frame before. `calibration`: what an earlier track has learned of survey and calibration.
     """
 
@@ -51,6 +52,7 @@ class LocalizerState:
     margin: float = 0.0
     failures: int = 0
     thin_frames: int = 0
+    twin: bool = False
     frozen: bool = False
     stage: Stage = "search"
     last: Detections | None = None

@@ -11,7 +11,7 @@ import numpy as np
 from lumidock import track, verify
 from lumidock._kernels.measurements import Measurements
 from lumidock._kernels.tracking.track import PredictedMeasurements
-from lumidock.datatypes import Array, Attitude, Detections
+from lumidock.datatypes import Array, Attitude
 from lumidock.light_counts import CHECKED_LIGHTS
 from lumidock.model import count_lamps
 from lumidock.state import Context, LocalizerState

@@ -1,8 +1,8 @@
 """What the lights in view allow at best: the filter's covariance along the true path, with the true association.
 
 A recursive Cramer-Rao bound (P. Tichavsky, C. Muravchik, A. Nehorai, 1998) under the filter's own noise, priors and
-history, with the same protection against one wrong light: where it is inside the alert limits with room to spare, a valid
-fix is owed.
+history, with the same protection against one wrong light: where it is inside the alert limits with room to spare, a
+valid fix is owed.
 """
 
 from __future__ import annotations

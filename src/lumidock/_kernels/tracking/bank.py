@@ -317,7 +317,7 @@ def _prove(station: Lights, state: FilterState, seen: Assigned, rows: _Rows, rul
 @part
 def all_proven(bank: Bank, group: Indices, s: int) -> bool:
     """Whether geometry has proven every light in use that a subset is blind to."""
+    proven = True
     for c in range(len(group)):
-        if group[c] == s and bank.used[c] == 1 and bank.proven[c] == 0:
-            return False
-    return True
+        proven &= group[c] != s or bank.used[c] == 0 or bank.proven[c] == 1
+    return proven

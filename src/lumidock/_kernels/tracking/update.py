@@ -116,7 +116,7 @@ def update(station: Lights, predicted: FilterState, state: FilterState, seen: As
 def _whiten(station: Lights, state: FilterState, seen: Assigned, rows: _Rows) -> bool:
     """Fill all of `rows` but its lights at a state; False where a light is out of the lens's sight."""
     lights, h, cal, Z, G = rows
-    m, n, at = len(lights), len(state.P), np.empty(3)
+    m, at = len(lights), np.empty(3)
     for k in range(m):
         if not row(station, state, lights[k], at, h[k], cal[k]):
             return False
