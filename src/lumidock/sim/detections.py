@@ -6,7 +6,7 @@ All frames of a run are made at once, as arrays: N frames, G runs (one, or as ma
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +16,7 @@ from lumidock.datatypes import Array, Attitude, Detections, Indices
 from lumidock.pose import project_lights
 from lumidock.sim.course import Course, course_of, mirror_image, project_each, shines
 from lumidock.sim.measured import Appearance, DetectionTable, as_measured, detector_errors, with_false
+from lumidock.sim.point_faults import bent, glints, seen_glints
 from lumidock.sim.scenario import BlackOuts, Scenario, rotations, spurious_paths
 from lumidock.station import Station
 
@@ -81,11 +82,15 @@ def simulated_frames(scenario: Scenario, station: Station, camera: Camera, seed:
     """
     course = course_of(scenario, station, camera, np.random.default_rng([seed, 0]))
     world = run_draws(scenario, station, course, np.random.default_rng([seed, 4]))
+    world = replace(world, p_dock=bent(scenario.detections, world.p_dock, np.random.default_rng([seed, 16])))
+    places = glints(scenario.detections, world.p_dock, world.dead, np.random.default_rng([seed, 17]))
     wander = _wandering(scenario, camera, course, np.random.default_rng([seed, 2]))
     rng = np.random.default_rng([seed, 1])
     uv, visible, range_m = _shown(scenario, station, camera, course, world)
     lit = visible & ~_dark(scenario, station, course, world, visible, rng)
     spurious = _spurious(scenario, world, wander, _box(scenario, camera, uv, visible), rng)
+    fixed = seen_glints(scenario.detections, camera, course, places, world.black)
+    spurious = np.concatenate([spurious[0], fixed[0]]), np.concatenate([spurious[1], fixed[1]])
     errors = detector_errors(scenario.detections.detector) if scenario.detections.detector else None
     detector_rng = np.random.default_rng([seed, 15])
     if errors:
@@ -200,7 +205,10 @@ def _dark(
     count = rng.integers(*scenario.faults.missing, len(visible), endpoint=True)
     missing = _some(visible & front, count, rng)[course.missing_from]
     dropped = rng.random(visible.shape) < scenario.detections.drop
-    off = failed(scenario, station, course.t_ns * 1e-9)
+    t_s = course.t_ns * 1e-9
+    off = failed(scenario, station, t_s)
+    for first, last in scenario.detections.front_off_s:
+        off |= front & ((t_s >= first) & (t_s <= last))[:, None]
     return np.asarray(missing | dropped | world.dead[course.run] | world.black[:, None] | off)
 
 

@@ -135,6 +135,10 @@ class DetectionKnobs(Section):
     dock: bool = True  # whether it is in view at all
     mirror: Literal["none", "only"] = "none"  # only: the array is seen in the water surface above it, and not itself
     surface_m: Lengths = (1.0, 4.0)  # height of the water surface above the dock's origin
+    glints: Counts = (0, 0)  # fixed to the structure beside lamps, drawn for a run, those of dead lamps first ...
+    glint_m: Lengths = (0.05, 0.15)  # ... this far from the lamp
+    bent_m: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0  # by which one light of a run is off its survey
+    front_off_s: tuple[Interval, ...] = ()  # times since the start in which the front layer is dark
     survey: bool = False  # lights stand off the station's positions by its survey_sigma
     calibration: bool = False  # the lens is off the camera's by the station's calibration_sigma
     black_outs: BlackOuts = BlackOuts()
