@@ -18,8 +18,8 @@ from lumidock.track import Track
 _REPEATED_SHARE, _REPEATED_SIGMAS = 0.7, 0.15  # of the detections, rms a coordinate: two draws of noise differ by 1.4
 _MOVES_M_S, _MOVES_RAD_S = 0.1, 0.02  # faster is not hovering
 _MOVED_SIGMAS = 0.3  # rms a coordinate that the lights are expected to have moved: twice what counts as a repetition
-_TOLD_SHARE = 0.2  # of a prior variance: with less taken out the test rests on linearisation
-_CONTRADICTION = 33.0  # chi-square, 1 dof, 1e-8: of a hundred states and some hundred independent looks in a docking
+_TOLD_SHARE = 0.02  # of a prior variance: with less taken out the test rests on linearisation
+_CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 
 
 def innovation_holds(track: Track, config: TrackConfig) -> bool:
