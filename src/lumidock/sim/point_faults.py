@@ -26,7 +26,8 @@ def glints(
 ) -> tuple[Array, np.ndarray]:
     """Positions (G, K, 3) m of the glints of each run, and which of them (G, K) there are: beside dead lamps first."""
     runs, lights, _ = p_dock.shape
-    count, most = rng.integers(*knobs.glints, runs, endpoint=True), min(knobs.glints[1], lights)
+    most = min(knobs.glints[1], lights)
+    count = np.asarray(rng.integers(*knobs.glints, runs, endpoint=True))
     beside = np.argsort(rng.random((runs, lights)) + ~dead, axis=1)[:, :most]
     away, angle = rng.uniform(*knobs.glint_m, (runs, most)), rng.uniform(0.0, 2.0 * np.pi, (runs, most))
     offset = np.stack([away * np.cos(angle), away * np.sin(angle), np.zeros_like(away)], axis=2)
