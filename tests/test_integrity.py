@@ -27,17 +27,17 @@ MODEL = station_model(STATION, CAMERA, Config().match)
 M = len(STATION)
 
 
-def hypothesis(T_dock_cam, P6, *, lights=4, log_weight=0.0, apart=None):
+def hypothesis(T_dock_cam, P6, *, lights=4, log_weight=0.0, pulled=None):
     """A track that holds `T_dock_cam` possible with the pose covariance `P6` (6, 6)."""
     T_cam_dock = se3_inverse(T_dock_cam)
     x, P = track.calibration_prior(STATION, None)
     P[:6, :6] = P6
     name = np.where(np.arange(M) < lights, np.arange(M), -1)
-    apart = np.zeros((M, 18)) if apart is None else apart
     R, t = np.ascontiguousarray(T_cam_dock[:3, :3]), np.ascontiguousarray(T_cam_dock[:3, 3])
-    last = FrameResult(name, MODEL.count(name), apart, NO_PLANE, 1.0, 0.0)
+    last = FrameResult(name, MODEL.count(name), NO_PLANE, 1.0, 0.0)
     seen, state = LastSeen(0, 0, (0, 0)), FilterState(R, t, x, P)
-    return Track(0, 0, state, seen, last, log_weight=log_weight, agreeing_frames=2)
+    bank = track.open_bank(MODEL) if pulled is None else pulled
+    return Track(0, 0, state, bank, seen, last, log_weight=log_weight, agreeing_frames=2)
 
 
 def at(z, rng=None):
@@ -81,7 +81,7 @@ def test_sigma_factors_are_those_of_the_chi_distribution(risk):
 def test_levels_hold_as_often_as_they_say(z_m, rng):
     risk, n = 0.02, 4000
     T_dock_cam, P6 = at(z_m, rng), covariance(rng)
-    bound = bounds([hypothesis(T_dock_cam, P6)], IntegrityConfig(risk=risk))
+    bound = bounds([hypothesis(T_dock_cam, P6)], MODEL, IntegrityConfig(risk=risk))
     draws = rng.multivariate_normal(np.zeros(6), P6, n)
     truths = [se3_inverse(se3_inverse(T_dock_cam) @ se3_exp(xi)) for xi in draws]
     over = np.mean([np.array(sizes(T_dock_cam, truth)) > levels_of(bound) for truth in truths], axis=0)
@@ -98,7 +98,7 @@ def test_levels_hold_as_often_as_they_say(z_m, rng):
 @pytest.mark.parametrize("place", [[0.0, 0.5, 0.08], [0.4, 0.01, 0.09], [0.02, 0.01, 0.0], [0.3, 0.02, -0.08]])
 def test_bearings_beside_the_origin_are_bounded(place, rng):
     T_cam_dock = se3_inverse(pose(place))
-    level = bounds([hypothesis(pose(place), np.eye(6) * 0.02**2)], IntegrityConfig()).guide.pl_bearing_rad
+    level = bounds([hypothesis(pose(place), np.eye(6) * 0.02**2)], MODEL, IntegrityConfig()).guide.pl_bearing_rad
     x, y, z = (T_cam_dock[:3, 3] + rng.normal(0.0, 0.02, (1_000_000, 3))).T
     off = [
         np.arctan2(a, z) - math.atan2(c, T_cam_dock[2, 3]) for a, c in ((x, T_cam_dock[0, 3]), (y, T_cam_dock[1, 3]))
@@ -108,7 +108,7 @@ def test_bearings_beside_the_origin_are_bounded(place, rng):
 
 def test_bounds_say_where_the_dock_is(rng):
     T_dock_cam = at(8.0, rng)
-    bound = bounds([hypothesis(T_dock_cam, covariance(rng))], IntegrityConfig())
+    bound = bounds([hypothesis(T_dock_cam, covariance(rng))], MODEL, IntegrityConfig())
     assert_close(bound.T_dock_cam, T_dock_cam, atol=1e-12)
     guide = bound.guide
     expected = bearing_and_range(T_dock_cam)
@@ -118,11 +118,11 @@ def test_bounds_say_where_the_dock_is(rng):
 def test_levels_rise_with_the_covariance_and_with_less_risk(rng):
     T_dock_cam, P6 = at(8.0, rng), covariance(rng)
     config = IntegrityConfig()
-    plain = levels_of(bounds([hypothesis(T_dock_cam, P6)], config))
-    assert_close(levels_of(bounds([hypothesis(T_dock_cam, 4.0 * P6)], config)), 2.0 * plain, rtol=1e-9)
+    plain = levels_of(bounds([hypothesis(T_dock_cam, P6)], MODEL, config))
+    assert_close(levels_of(bounds([hypothesis(T_dock_cam, 4.0 * P6)], MODEL, config)), 2.0 * plain, rtol=1e-9)
     more = covariance(rng)
-    assert (levels_of(bounds([hypothesis(T_dock_cam, P6 + more)], config)) >= plain).all()
-    assert (levels_of(bounds([hypothesis(T_dock_cam, P6)], IntegrityConfig(risk=1e-7))) > plain).all()
+    assert (levels_of(bounds([hypothesis(T_dock_cam, P6 + more)], MODEL, config)) >= plain).all()
+    assert (levels_of(bounds([hypothesis(T_dock_cam, P6)], MODEL, IntegrityConfig(risk=1e-7))) > plain).all()
 
 
 def test_levels_hold_every_other_hypothesis_that_is_not_out_of_the_question(rng):
@@ -132,30 +132,41 @@ def test_levels_hold_every_other_hypothesis_that_is_not_out_of_the_question(rng)
         a = hypothesis(T_a, covariance(rng))
         near = hypothesis(T_b, covariance(rng), log_weight=-10.0)
         far = replace(near, log_weight=-15.0)  # e^-15 < 1e-6
-        wide = levels_of(bounds([a, near], config))
+        wide = levels_of(bounds([a, near], MODEL, config))
         assert (wide[:2] >= np.array(sizes(T_a, T_b))[:2]).all()
         assert wide[2] >= np.linalg.norm(claims.pose_error(T_a, T_b)[3:])
-        assert (wide >= levels_of(bounds([near], config))).all()
-        assert_close(levels_of(bounds([a, far], config)), levels_of(bounds([a], config)))
+        assert (wide >= levels_of(bounds([near], MODEL, config))).all()
+        assert_close(levels_of(bounds([a, far], MODEL, config)), levels_of(bounds([a], MODEL, config)))
 
 
-def test_a_light_that_pulls_the_pose_widens_the_levels_from_six_lights_on(rng):
+def bank_with(light, offset, P6, *, proven=False):
+    """A bank in which only the state that is blind to one light has begun: `offset` (6,) off, of covariance `P6`."""
+    bank = track.open_bank(MODEL)
+    bank.begun[light], bank.offset[light, :6] = 1, offset
+    bank.P[light] = 0.0
+    bank.P[light, :6, :6] = P6
+    return bank._replace(used=np.eye(M, dtype=np.int64)[light], proven=np.eye(M, dtype=np.int64)[light] * proven)
+
+
+@pytest.mark.parametrize("lights", [4, 6, 13])
+@pytest.mark.parametrize("proven", [False, True])
+def test_levels_reach_the_state_that_never_saw_a_light(lights, proven, rng):
     T_dock_cam, P6, config = at(8.0, rng), covariance(rng), IntegrityConfig()
-    apart = np.zeros((M, 18))
-    apart[2, :9] = [0.5, -0.3, 0.7, 0.01, 0.02, -0.03, 0.02, 0.03, 0.6]
-    apart[2, 9:] = 1e-5
-    plain = levels_of(bounds([hypothesis(T_dock_cam, P6, lights=6)], config))
-    five, six = (levels_of(bounds([hypothesis(T_dock_cam, P6, lights=n, apart=apart)], config)) for n in (5, 6))
-    assert_close(five, plain)
-    moved = [math.hypot(0.5, 0.3), 0.7, np.linalg.norm([0.01, 0.02, 0.03]), math.hypot(0.02, 0.03), 0.6]
-    assert (six > np.maximum(plain, moved)).all()
+    apart = np.array([0.05, -0.03, 0.07, 0.001, 0.002, -0.003])  # small: the levels are linear
+    T_blind = se3_inverse(se3_inverse(T_dock_cam) @ se3_exp(apart))
+    plain = levels_of(bounds([hypothesis(T_dock_cam, P6, lights=lights)], MODEL, config))
+    pulled = bank_with(2, apart, 2.0 * P6, proven=proven)
+    level = levels_of(bounds([hypothesis(T_dock_cam, P6, lights=lights, pulled=pulled)], MODEL, config))
+    assert (level >= plain).all()
+    fault = config.fault_proven if proven else config.fault
+    alone = levels_of(bounds([hypothesis(T_dock_cam, 2.0 * P6)], MODEL, IntegrityConfig(risk=config.risk / fault)))
+    assert (level > 0.98 * (np.array(sizes(T_dock_cam, T_blind)) + alone)).all()
 
 
 def test_a_light_that_cannot_be_left_out_leaves_no_level(rng):
-    apart = np.zeros((M, 18))
-    apart[1, 9:] = np.inf
-    bound = bounds([hypothesis(at(8.0, rng), covariance(rng), lights=7, apart=apart)], IntegrityConfig())
-    assert np.isinf(levels_of(bound)).all()
+    pulled = bank_with(1, np.zeros(6), np.full((6, 6), np.nan))
+    bound = bounds([hypothesis(at(8.0, rng), covariance(rng), lights=7, pulled=pulled)], MODEL, IntegrityConfig())
+    assert not np.isfinite(levels_of(bound)).any()
     assert not pose_holds(bound, DEFAULT_ALERT_LIMITS)
     assert not guide_holds(bound, DEFAULT_ALERT_LIMITS)
 

@@ -239,7 +239,7 @@ def test_the_description_is_replaced_in_one_piece(tmp_path):
         folder.describe({"counts": 3})
     assert json.loads((tmp_path / "run.json").read_text()) == {"counts": 3}
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
-        ["fixes.csv", "lights.csv", "layers.csv", "trajectory.tum", "run.json"]
+        ["fixes.csv", "lights.csv", "layers.csv", "alternatives.csv", "trajectory.tum", "run.json"]
     )
 
 

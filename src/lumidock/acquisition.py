@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from lumidock import match, track, verify
+from lumidock import match, model, track, verify
 from lumidock._kernels.measurements import Measurements
-from lumidock.datatypes import Attitude
-from lumidock.light_counts import POSE_LIGHTS
+from lumidock.datatypes import Attitude, Indices
+from lumidock.light_counts import CHECKED_LIGHTS, POSE_LIGHTS
 from lumidock.match import Acquisition, Hypothesis
 from lumidock.model import attitude_prior
 from lumidock.state import Context, LocalizerState
@@ -27,11 +27,20 @@ class Moment:
     attitude: Attitude | None
     context: Context
 
-    def acquire(self) -> Acquisition:
-        """What the detections can be without history."""
+    def acquire(self, *, all_mirrors: bool = False) -> Acquisition:
+        """What the detections can be without history; with `all_mirrors` images in walls and floor are rivals too."""
         config, context = self.context.config, self.context
         prior = attitude_prior(self.attitude, config.prior)
-        return match.acquire(self.frame, context.model, context.camera, prior, config.match)
+        return match.acquire(self.frame, context.model, context.camera, prior, config.match, all_mirrors=all_mirrors)
+
+    def shows_twin(self, assignment: Indices) -> bool:
+        """Whether the detections that an association leaves over are another array of the same layout."""
+        frame = match.without(self.frame, assignment)
+        if self.context.station.dock_exclusive or model.count_lamps(frame) < CHECKED_LIGHTS:
+            return False
+        config, prior = self.context.config, attitude_prior(self.attitude, self.context.config.prior)
+        twin = match.acquire(frame, self.context.model, self.context.camera, prior, config.match)
+        return verify.is_answer(twin, config.match)
 
     def start(self, hypothesis: Hypothesis, calibration: CalibrationStates | None) -> Track | None:
         """A new track from a hypothesis and what is known of survey and calibration; None for two lights or fewer."""
@@ -75,6 +84,7 @@ def confirm(
         hypotheses=likeliest([*held, *begun], context),
         confirmed=True,
         margin=max(found.certainty, context.config.match.margin),
+        thin_frames=0,
         calibration=calibration,
     )
     return confirmed, True

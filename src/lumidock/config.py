@@ -10,6 +10,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeIn
 from lumidock.yamlfile import read_mapping, validate
 
 PositiveFloat = Annotated[float, Field(ge=1e-12, le=1e9)]  # its square, and one over that, are numbers too
+Risk = Annotated[float, Field(ge=1e-12, le=1e-2)]  # a larger one protects nothing, a smaller one no normal tail backs
+Age = Annotated[float, Field(gt=0.0, le=5.0)]  # s; after it the vehicle's motion is anyone's guess
+NoisePx = Annotated[float, Field(ge=0.05, le=100.0)]  # no detector is better than a twentieth of a pixel
+Pairs = Annotated[int, Field(ge=1, le=10_000_000)]  # 15 s of search
+Hypotheses = Annotated[int, Field(ge=1, le=256)]  # each holds a bank of covariances, 0.4 MB with 13 lights
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Hue = Annotated[int, Field(ge=0, le=179)]
 Effort = Annotated[int, Field(ge=1, le=10_000)]
@@ -219,7 +224,7 @@ class PriorConfig(SettingsGroup):
 class MatchConfig(SettingsGroup):
     """Acquisition: the evidence of an association, and when it decides."""
 
-    noise_px: PositiveFloat = 0.5  # 1 sigma of a centroid that comes without a covariance
+    noise_px: NoisePx = 0.5  # 1 sigma of a centroid that comes without a covariance
     unlikely_radii: Fraction = 0.5  # 1 sigma of a centroid, in blob radii, as the blob's p_light goes to 0
     detect: Annotated[float, Field(gt=0, lt=1)] = 0.8  # probability that a light in view is detected
     layer_absent: Annotated[float, Field(gt=0, lt=1)] = 0.3  # probability that a whole layer is not seen
@@ -236,19 +241,17 @@ class MatchConfig(SettingsGroup):
     roll_gate: PositiveFloat = 3.3  # sigmas of the prior by which a candidate may be rolled
     near_m: PositiveFloat = 0.3  # least and ...
     far_m: PositiveFloat = 40.0  # ... greatest distance of a light
-    hypotheses: PositiveInt = 64  # kept while lights are added to them
+    hypotheses: Hypotheses = 64  # kept while lights are added to them
     # of more detections only the likeliest lamps are considered: so many, or `detections_per_light` times the lights
     least_detections: PositiveInt = 16
     detections_per_light: PositiveInt = 2
-    max_pairs: PositiveInt = 40_000  # of detections, 1.5 us each; a frame that needs more is refused: `too_many`
+    max_pairs: Pairs = 40_000  # of detections, 1.5 us each; a frame that needs more is refused: `too_many`
     log_dock: float = 2.0  # log prior odds that the dock is in view at all
     max_detections_three: PositiveInt = 14  # among more detections, three lights of a layer identify nothing
     sure: PositiveFloat = 15.0  # log evidence above which associations of three lights a layer are not searched for
     margin: PositiveFloat = 6.9  # log odds of an association that one frame decides, ln 1000
     margin_gathered: PositiveFloat = 9.2  # the same gathered over frames, or with three lights; ln 10,000
     lead: PositiveFloat = 3.5  # log odds by which a gathered hypothesis must also lead in the last frame alone
-    min_layer: PositiveInt = 3  # lights of a second layer; fewer are not identified, since they would set the tilt
-    enough: PositiveInt = 4  # identified lights, with which the doubtful ones may be dropped
     extra: PositiveFloat = 7.5  # log odds of an identified light beyond those four
     prune: PositiveFloat = 5.0  # log odds below which an identified light is dropped in any case
     keep: PositiveFloat = 14.0  # log evidence behind the best at which a hypothesis is dropped
@@ -258,35 +261,40 @@ class MatchConfig(SettingsGroup):
 class TrackConfig(SettingsGroup):
     """Tracking: the filter's motion model, association and hypotheses."""
 
-    accel_m_s2: PositiveFloat = 0.3  # white noise on the velocity: what a second adds to it, 1 sigma
-    accel_rad_s2: PositiveFloat = 0.05  # the same on the rotation rate
+    # white noise on the velocity: what a second adds to it, 1 sigma
+    accel_m_s2: Annotated[float, Field(ge=0.01, le=100.0)] = 0.3
+    accel_rad_s2: Annotated[float, Field(ge=0.002, le=100.0)] = 0.05  # the same on the rotation rate
     start_m_s: PositiveFloat = 1.5  # 1 sigma of the unknown velocity at the start
     start_rad_s: PositiveFloat = 0.15  # 1 sigma of the unknown rotation rate at the start
     gate: PositiveFloat = 18.4  # squared Mahalanobis distance: chi-square, 2 dof, exceeded with 1e-4
     reach: PositiveFloat = 10.0  # log evidence behind the best at which an association is not followed
-    max_nodes: PositiveInt = (
-        100_000  # of the association's search, 0.1 us each; a hypothesis that needs more is dropped
-    )
+    max_nodes: Pairs = 100_000  # of the association's search, 0.1 us each; a hypothesis that needs more is dropped
     log_appear: float = -6.9  # log prior that a layer comes into view in one frame
-    joint_lights: PositiveInt = 3  # of each of two layers, before survey and calibration are estimated
-    max_gap_s: PositiveFloat = 2.0  # without lights; after it only the calibration states are kept
-    max_deviate: PositiveFloat = 4.0  # of one frame's NIS, as a standard normal deviate
-    max_mean_deviate: PositiveFloat = 3.5  # of the running mean of that deviate
+    # 1 sigma to which the others predict a light that geometry proves; glints lie 2 cm and more beside the lamps
+    proven_m: Annotated[float, Field(ge=1e-6, le=0.05)] = 0.01
+    max_gap_s: Age = 2.0  # without lights; after it only the calibration states are kept
+    max_deviate: Annotated[float, Field(ge=2.0, le=8.0)] = 4.0  # of one frame's NIS, as a standard normal deviate
+    max_mean_deviate: Annotated[float, Field(ge=2.0, le=8.0)] = 3.5  # of the running mean of that deviate
     deviate_memory: Fraction = 0.8  # share of the running mean that is kept from frame to frame
-    hypotheses: PositiveInt = 32  # poses or associations followed side by side
+    hypotheses: Hypotheses = 32  # poses or associations followed side by side
     forget: PositiveFloat = 16.0  # log odds behind the best at which one of them is dropped
 
 
 class IntegrityConfig(SettingsGroup):
     """When a pose may be used."""
 
-    risk: PositiveFloat = 1e-6  # probability in a frame that an error exceeds its protection level
-    fault: PositiveFloat = 1e-5  # prior probability that an identified light is wrong; 2e-6 in campaigns
-    separate_from: PositiveInt = 6  # lights, from which the solution is separated for one faulty light
-    evidence: PositiveFloat = 13.8  # log odds that meet the risk where too few lights check each other, -ln 1e-6
-    carried_frames: PositiveInt = 2  # frames in a row with four lights or more that agree, which meet it as well
+    risk: Risk = 1e-6  # probability in a frame that an error exceeds its protection level
+    # prior probability that an associated light is wrong, until geometry has proven it
+    fault: Annotated[float, Field(ge=1e-6, le=0.1)] = 1e-3
+    fault_proven: Annotated[float, Field(ge=1e-7, le=0.1)] = 2e-6  # afterwards; as often as in nominal campaigns
+    # log odds that meet the risk where too few lights check each other, -ln 1e-6
+    evidence: Annotated[float, Field(ge=4.6, le=1e3)] = 13.8
+    # frames in a row with four lights or more that agree, which meet it as well
+    carried_frames: Annotated[int, Field(ge=2, le=10_000)] = 2
     gathered_frames: PositiveInt = 15  # the same for an association that no single frame could decide
-    max_age_s: PositiveFloat = 0.3  # of the last detected light, up to which a fix is predicted
+    # frames in a row with fewer than four lights, after which a fresh acquisition must agree
+    thin_frames: Annotated[int, Field(ge=1, le=30)] = 3
+    max_age_s: Age = 0.3  # of the last detected light, up to which a fix is predicted
 
 
 class Config(SettingsGroup):

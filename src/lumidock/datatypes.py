@@ -215,6 +215,14 @@ class Guide:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Alternative:
+    """A pose `T_dock_cam` (4, 4) that fits where none is proven, with its `probability` among those that fit."""
+
+    probability: float
+    T_dock_cam: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Fix:
     """The answer for one frame: `T_dock_cam` (4, 4) when `valid`, otherwise no pose and a `reason`.
 
@@ -222,7 +230,8 @@ class Fix:
     from a method that knows them. `guide` is there when bearing and range may be used. `nis` is the normalised
     innovation squared of a tracked frame over its degrees of freedom, 1 on average where noise is as stated; NaN
     without history. `n_seen` counts the frame's detections and `n_used` those behind the pose; `by_layer` holds what
-    each layer's lights give alone, where a method works by layer.
+    each layer's lights give alone, where a method works by layer. `alternatives`: the poses that fit while none is
+    proven, the likeliest first; never a fix.
     """
 
     frame: str
@@ -239,6 +248,7 @@ class Fix:
     protection: Protection | None = None
     guide: Guide | None = None
     nis: float = math.nan
+    alternatives: tuple[Alternative, ...] = ()
 
     def __post_init__(self) -> None:
         if (self.T_dock_cam is None) != bool(self.reason):

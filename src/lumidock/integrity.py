@@ -9,18 +9,21 @@ from functools import cache
 
 import numpy as np
 
-from lumidock._kernels.tracking.levels import SigmaFactors, protection_levels
+from lumidock._kernels.tracking.levels import Groups, SigmaFactors, protection_levels
 from lumidock.alert_limits import AlertLimits
 from lumidock.config import IntegrityConfig
-from lumidock.datatypes import Array, Detections, Fix, Guide, Match, Protection, Stage, Status
+from lumidock.datatypes import Alternative, Array, Detections, Fix, Guide, Match, Protection, Stage, Status
+from lumidock.geometry import se3_inverse
 from lumidock.model import StationModel, light_of
 from lumidock.state import Context, LocalizerState
 from lumidock.track import Track
-from lumidock.verify import is_proven
+from lumidock.verify import contradict, contradicted_file, is_proven
 
 _ANY_BEARING_RAD = math.sqrt(2.0) * math.pi  # at the origin itself a bearing says nothing ...
 _CLEAR, _STEEP_RAD = 2.0, 0.3  # ... which begins so many range levels away, or with such a bearing level
+_COIN = 0.5  # a level that an error exceeds as often as not is none: no more of the risk is given to a fault
 _IDENTITY = np.eye(4)  # copied: half as long as another
+_OPEN = ("ambiguous", "unproven")  # reasons with which the poses that fit are given
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,19 +36,19 @@ class Bounds:
     guide: Guide
 
 
-def bounds(tracks: Sequence[Track], config: IntegrityConfig) -> Bounds:
+def bounds(tracks: Sequence[Track], model: StationModel, config: IntegrityConfig) -> Bounds:
     """Protection of the first hypothesis, wide enough to hold every other that is likelier than the risk.
 
-    Without a fault the levels are factors on sigma; with six or more lights they also hold when any one of them is at
-    fault (M. Joerger et al., "Solution separation versus residual-based RAIM", 2014).
+    Without a fault the levels are factors on sigma; they also hold when any one light has been at fault at any time
+    since the track began (`_kernels.tracking.bank`).
     """
     first = tracks[0]
     cov = np.empty((9, 9))
-    pl = _levels(first, config, cov)
+    pl = _levels(first, model, config, cov)
     for other in tracks[1:]:
         if first.log_weight - other.log_weight < -math.log(config.risk):
             apart = _apart(first, other)
-            wider = apart + np.array(_levels(other, config, np.empty((9, 9))))
+            wider = apart + np.array(_levels(other, model, config, np.empty((9, 9))))
             pl = tuple(np.maximum(pl, wider).tolist())
     T_dock_cam, R_dock_cam, t = _IDENTITY.copy(), first.state.R.T, first.state.t
     T_dock_cam[:3, :3], T_dock_cam[:3, 3] = R_dock_cam, -(R_dock_cam @ t)
@@ -67,13 +70,22 @@ def bounds(tracks: Sequence[Track], config: IntegrityConfig) -> Bounds:
     )
 
 
-def _levels(track: Track, config: IntegrityConfig, cov: Array) -> tuple[float, ...]:
+def _levels(track: Track, model: StationModel, config: IntegrityConfig, cov: Array) -> tuple[float, ...]:
     """Lateral m, axial m, angle rad, bearing rad, range m of one hypothesis; fills `cov` (9, 9)."""
-    last = track.last
-    fault_risk = min(config.risk / (config.fault * max(last.n_used, 1)), 0.5)
-    separate = last.n_used >= config.separate_from
-    factors = SigmaFactors(sigma_factors(config.risk), sigma_factors(fault_risk), separate)
-    return protection_levels(track.state, last.separations, last.plane, factors, cov)
+    begun = track.bank.begun == 1
+    if not math.isfinite(float(track.bank.P[begun, :6, :6].sum() + track.bank.offset[begun].sum())):
+        return (math.inf,) * 5  # a light that cannot be left out leaves no level
+    factors = fault_factors(int(track.bank.used.sum()), config)
+    return protection_levels(track.state, track.last.plane, track.bank, Groups(model.group, model.planes), factors, cov)
+
+
+def fault_factors(n_lights: int, config: IntegrityConfig) -> SigmaFactors:
+    """The factors with `n_lights` lights that may be at fault, one at a time: they share the risk."""
+
+    def of(prior: float) -> Array:
+        return sigma_factors(min(config.risk / (prior * max(n_lights, 1)), _COIN))
+
+    return SigmaFactors(sigma_factors(config.risk), of(config.fault), of(config.fault_proven))
 
 
 @cache
@@ -142,9 +154,9 @@ def assess(
     first, config = state.first, context.config.integrity
     if status == "coasting" and (reason := _why_no_coasting(first, detections.t_ns, config)):
         return no_fix(state, detections, status, reason), state
-    bound = bounds(state.hypotheses, config)
-    proven = is_proven(first, state.margin, config)
-    valid, used = proven and pose_holds(bound, context.station.alert_limits), first.last.n_used
+    bound = bounds(state.hypotheses, context.model, config)
+    doubt, limits = _doubt(state, context), context.station.alert_limits
+    valid, used = not doubt and pose_holds(bound, limits), first.last.n_used
     now = stage(first, context.model) or state.stage
     state = state if now == state.stage else replace(state, stage=now)
     fix = Fix(
@@ -155,14 +167,37 @@ def assess(
         n_seen=len(detections),
         n_used=used,
         T_dock_cam=bound.T_dock_cam if valid else None,
-        reason="" if valid else "protection" if proven else "ambiguous",
+        reason="" if valid else doubt or "protection",
         match=Match(detections, light_of(first.last.assignment, len(detections))),
         covariance=bound.covariance if valid else None,
         protection=bound.protection if valid else None,
-        guide=bound.guide if proven and guide_holds(bound, context.station.alert_limits) else None,
+        guide=bound.guide if not doubt and guide_holds(bound, limits) else None,
         nis=first.last.nis / (2 * used) if status == "tracking" else math.nan,
+        alternatives=alternatives(state.hypotheses) if doubt in _OPEN else (),
     )
     return fix, state
+
+
+def alternatives(tracks: Sequence[Track]) -> tuple[Alternative, ...]:
+    """The poses that hypotheses hold possible, with their probabilities among them."""
+    if not tracks:
+        return ()
+    share = np.exp(np.array([one.log_weight for one in tracks]) - tracks[0].log_weight)
+    share /= share.sum()
+    return tuple(Alternative(float(p), se3_inverse(one.T_cam_dock)) for p, one in zip(share, tracks, strict=True))
+
+
+def _doubt(state: LocalizerState, context: Context) -> str:
+    """The word for a track that no level makes valid: another fits too, it is not proven, or the files are wrong."""
+    first, config = state.first, context.config.integrity
+    if not is_proven(first, state.margin, config):
+        rivals = state.hypotheses[1:]
+        return "ambiguous" if any(contradict(first.last.assignment, r.last.assignment) for r in rivals) else "unproven"
+    if state.twin:
+        return "ambiguous"
+    if state.thin_frames >= config.thin_frames:
+        return "unproven"
+    return contradicted_file(first, context.prior_var)[0]
 
 
 def _why_no_coasting(first: Track, t_ns: int, config: IntegrityConfig) -> str:
@@ -179,4 +214,5 @@ def no_fix(state: LocalizerState, detections: Detections, status: Status, reason
     """The answer to a frame that gives no pose, and why."""
     spurious = Match(detections, np.full(len(detections), -1, np.int64))
     frame, t_ns, seen = detections.frame, detections.t_ns, len(detections)
-    return Fix(frame, t_ns, status, state.stage, n_seen=seen, reason=reason, match=spurious)
+    poses = alternatives(state.hypotheses) if reason in _OPEN else ()
+    return Fix(frame, t_ns, status, state.stage, n_seen=seen, reason=reason, match=spurious, alternatives=poses)

@@ -13,9 +13,9 @@ from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Fix, Frame
 from lumidock.errors import FrameError, InputError
-from lumidock.light_counts import MAX_DETECTIONS, MAX_LIGHTS, POSE_LIGHTS
+from lumidock.light_counts import CHECKED_LIGHTS, MAX_DETECTIONS, MAX_LIGHTS, POSE_LIGHTS
 from lumidock.match import Acquisition
-from lumidock.model import count_lamps, measurements
+from lumidock.model import count_lamps, measurements, possible_lamps
 from lumidock.state import Context, LocalizerState
 from lumidock.station import Station
 from lumidock.track import Track, learned_calibration, sees_two_layers
@@ -78,10 +78,11 @@ def step(
     if refused == "bad_stamp":
         return integrity.no_fix(state, detections, "none", refused), replace(state, last=detections)
     predicted = predicted.with_attitude(detections.attitude)
-    state = _arrived(state, detections, predicted, context)
+    frame = measurements(detections, context.model, context.config.match)
+    refused = refused or ("frozen" if tracking.is_frozen(state, predicted, frame, context) else "")
+    state = replace(_arrived(state, detections, predicted, context), frozen=refused == "frozen")
     if refused:
         return integrity.no_fix(state, detections, "coasting" if state.confirmed else "none", refused), state
-    frame = measurements(detections, context.model, context.config.match)
     followed = tracking.follow(predicted, frame, context, confirmed=state.confirmed)
     moment = Moment(detections.t_ns, frame, detections.attitude, context)
     if state.confirmed and followed and verify.holds(followed[0], count_lamps(frame), context.config.track):
@@ -99,7 +100,7 @@ def _why_refused(last: Detections | None, detections: Detections) -> str:
         return "bad_stamp"
     if last is not None and len(detections) and np.array_equal(detections.uv, last.uv):
         return "frozen"
-    return "too_many" if len(detections) > MAX_DETECTIONS else ""
+    return "too_many" if possible_lamps(detections) > MAX_DETECTIONS else ""
 
 
 def _arrived(state: LocalizerState, detections: Detections, predicted: Prediction, context: Context) -> LocalizerState:
@@ -118,7 +119,7 @@ def _tracked(
 ) -> tuple[Fix, LocalizerState]:
     """A confirmed track holds; where it may overlook a layer, the frame is acquired anew to compare."""
     context = moment.context
-    tracked = replace(state, hypotheses=tuple(followed), failures=0)
+    tracked = _checked(replace(state, hypotheses=tuple(followed), failures=0), moment)
     if not tracking.overlooks(followed[0], moment.frame, context):
         return integrity.assess(tracked, detections, "tracking", context)
     found = moment.acquire()
@@ -129,11 +130,27 @@ def _tracked(
     return _acquired(doubted, followed, detections, moment, found, still_held=followed[:1])
 
 
+def _checked(state: LocalizerState, moment: Moment) -> LocalizerState:
+    """Count the frames that too few lights hold; after some of them a fresh acquisition has to agree with the track.
+
+    A mirror image or another array may have taken over in the meantime, and would go on agreeing with itself.
+    """
+    config, used = moment.context.config, state.first.last.n_used
+    if used < CHECKED_LIGHTS:
+        return replace(state, thin_frames=state.thin_frames + 1)
+    state = replace(state, twin=moment.shows_twin(state.first.last.assignment))
+    if state.thin_frames < config.integrity.thin_frames:
+        return replace(state, thin_frames=0)
+    found = moment.acquire(all_mirrors=True)
+    agrees = verify.agrees(found, state.first.last.assignment, config.match)
+    return replace(state, thin_frames=0) if agrees else state
+
+
 def _shows_two_layers(found: Acquisition, context: Context) -> bool:
     """Whether one frame alone decides on an association with lights enough of two layers."""
     if not verify.is_answer(found, context.config.match):
         return False
-    return sees_two_layers(context.model.count(found.hypotheses[0].assignment), context.config.track)
+    return sees_two_layers(context.model.count(found.hypotheses[0].assignment))
 
 
 def _lost(
@@ -166,7 +183,10 @@ def _acquired(
 ) -> tuple[Fix, LocalizerState]:
     """What an acquisition gives: a track confirmed by this frame, or by several; else coasting, or no fix."""
     context = moment.context
-    if verify.is_answer(found, context.config.match):
+    answer = verify.is_answer(found, context.config.match)
+    if answer and moment.shows_twin(found.hypotheses[0].assignment):
+        return integrity.no_fix(state, detections, "none", "ambiguous"), replace(state, confirmed=False, hypotheses=())
+    if answer:
         state, confirmed = acquisition.confirm(state, found, moment, still_held)
         if confirmed:
             return integrity.assess(state, detections, "acquired", context)
@@ -192,4 +212,5 @@ def _coasting(
 ) -> tuple[Fix, LocalizerState]:
     """A confirmed track in a frame in which no light fits."""
     tracks = tracking.coast(state.hypotheses, context, failed=reason == "residual")
-    return integrity.assess(replace(state, hypotheses=tracks), detections, "coasting", context)
+    state = replace(state, hypotheses=tracks, thin_frames=state.thin_frames + 1)
+    return integrity.assess(state, detections, "coasting", context)

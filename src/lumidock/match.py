@@ -15,7 +15,7 @@ of everything that speaks against it,
 `mirror` holds the prior `log_mirror`; `crowding` is by how much, as a logarithm, unassigned detections stand denser
 around the assigned ones than the evidence's clutter has it. Lights of too small `odds_c` are dropped (`kept`).
 
-    certainty = margin - crowding, and no more than the configured margin where fewer than `enough` lights are each
+    certainty = margin - crowding, and no more than the configured margin where fewer than four lights are each
                 beyond doubt
 
 An answer has four lights and a margin over the configured one (`verify.is_answer`); `certainty` is what later frames
@@ -36,10 +36,10 @@ from lumidock._kernels.measurements import Measurements
 from lumidock.camera import Camera
 from lumidock.config import MatchConfig
 from lumidock.datatypes import Array, Indices
-from lumidock.light_counts import CHECKED_LIGHTS, POSE_LIGHTS
-from lumidock.model import AttitudePrior, StationModel, light_of
+from lumidock.light_counts import CHECKED_LIGHTS, LAYER_LIGHTS, POSE_LIGHTS
+from lumidock.model import LEAST_P_LIGHT, AttitudePrior, StationModel, light_of, weights
 
-_MIRROR = np.array([1.0, -1.0, 1.0])  # the water's surface is level, and so is dock x, z
+_LEVEL, _UPRIGHT = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])  # images in surface or floor; in a wall
 _NONE = -HUGE  # log evidence of what is impossible
 _MAX_RELABELLINGS = 4  # each betters the evidence; more than two have not been seen
 _OPEN_ROLL_RAD = math.radians(45.0)  # 1 sigma; of a roll less known than this a steady vehicle says nothing
@@ -91,21 +91,29 @@ class _Search:
     model: StationModel
     config: MatchConfig
 
-    def mirrored(self) -> Problem:
-        """The problem with the lights as the water's surface shows them."""
-        return self.problem._replace(p=self.problem.p * _MIRROR, axis=self.problem.axis * _MIRROR)
+    def mirrored(self, by: Array) -> Problem:
+        """The problem with the lights as a mirror shows them that turns the axes of the dock `by` (3,)."""
+        return self.problem._replace(p=self.problem.p * by, axis=self.problem.axis * by)
 
 
 def acquire(
-    frame: Measurements, model: StationModel, camera: Camera, prior: AttitudePrior, config: MatchConfig
+    frame: Measurements,
+    model: StationModel,
+    camera: Camera,
+    prior: AttitudePrior,
+    config: MatchConfig,
+    *,
+    all_mirrors: bool = False,
 ) -> Acquisition:
     """The most probable association of one frame's detections, and what it must be held against.
 
-    Of many detections those that look least like lamps stay out.
+    Of many detections those that look least like lamps stay out. With `all_mirrors` walls and floor are rivals too,
+    besides the water's surface.
     """
     likely = _likeliest(frame, max(config.least_detections, config.detections_per_light * len(model)))
     if likely is not None:
-        return _renumbered(acquire(_part(frame, likely), model, camera, prior, config), likely)
+        part = _part(frame, likely)
+        return _renumbered(acquire(part, model, camera, prior, config, all_mirrors=all_mirrors), likely)
     task = _Search(_problem(frame, model, camera, prior, config), model, config)
     found, complete = _search(task, task.problem, POSE_LIGHTS, CHECKED_LIGHTS, POSE_LIGHTS)
     if not complete:
@@ -114,10 +122,12 @@ def acquire(
         return Acquisition((), (), 0.0, "too_few" if len(frame.uv) < POSE_LIGHTS else "ambiguous")
     first = Hypothesis(found.assignments[0], found.R[0], found.t[0], float(found.log_evidence[0]))
     top, doubt = _relabelled(task, first)
-    return _decided(task, frame, found, top, doubt)
+    return _decided(task, frame, found, top, doubt, _mirror_evidence(task, top, all_mirrors=all_mirrors))
 
 
-def _decided(task: _Search, frame: Measurements, found: Hypotheses, top: Hypothesis, doubt: Doubt) -> Acquisition:
+def _decided(
+    task: _Search, frame: Measurements, found: Hypotheses, top: Hypothesis, doubt: Doubt, mirror: float
+) -> Acquisition:
     """The decision of the module's docstring on the hypotheses `found` and the best, `top`."""
     config, scores = task.config, found.log_evidence
     poses = [pose for pose in (_other_pose(task, top, level=level) for level in (False, True)) if pose is not None]
@@ -126,24 +136,37 @@ def _decided(task: _Search, frame: Measurements, found: Hypotheses, top: Hypothe
     odds = _odds(top, best, found, doubt, crowding)
     kept = _kept(top.assignment, odds, task)
     conflicting = scores[conflicts(kept, found.assignments)]
-    mirror = _mirror_evidence(task, top)
     against = float(np.logaddexp.reduce([-config.log_dock, mirror, *doubt.against[kept >= 0], *conflicting]))
     margin = best - against
-    beyond_doubt = int((odds[kept >= 0] > config.margin_gathered).sum()) >= config.enough
+    beyond_doubt = int((odds[kept >= 0] > config.margin_gathered).sum()) >= CHECKED_LIGHTS
     direct = float(np.logaddexp.reduce([_NONE, *scores[(found.assignments != top.assignment).any(axis=1)]]))
     return Acquisition(
         hypotheses=(replace(top, assignment=kept), *_rest(found, kept, best - config.keep)),
         other_poses=tuple(replace(pose, assignment=kept) for pose in poses),
         margin=margin,
-        reason="mirror" if mirror > max(best - config.margin, direct) else "ambiguous",
-        certainty=min(margin - (crowding if unassigned else 0.0), math.inf if beyond_doubt else config.margin),
+        reason=_why_open(best - config.margin, mirror, direct),
+        certainty=min(margin - crowding * min(unassigned, 1.0), math.inf if beyond_doubt else config.margin),
     )
+
+
+def _why_open(close: float, mirror: float, direct: float) -> str:
+    """The word for an association that does not stand out: what comes `close` to its log evidence, if anything."""
+    if max(mirror, direct) <= close:
+        return "unproven"
+    return "mirror" if mirror > direct else "ambiguous"
 
 
 def _rest(found: Hypotheses, kept: Indices, least: float) -> list[Hypothesis]:
     """The hypotheses over a `least` log evidence whose assignment is not the one `kept`."""
     rows = zip(found.assignments, found.R, found.t, found.log_evidence, strict=True)
     return [Hypothesis(a, R, t, float(e)) for a, R, t, e in rows if e > least and (a != kept).any()]
+
+
+def without(frame: Measurements, assignment: Indices) -> Measurements:
+    """A frame without the detections of an assignment (M,)."""
+    left = np.ones(len(frame.uv), bool)
+    left[assignment[assignment >= 0]] = False
+    return _part(frame, np.flatnonzero(left))
 
 
 def _part(frame: Measurements, which: Indices) -> Measurements:
@@ -154,9 +177,10 @@ def _part(frame: Measurements, which: Indices) -> Measurements:
 
 def _likeliest(frame: Measurements, most: int) -> Indices | None:
     """The detections (K,) that look most like lamps, `most` and those on a par; None where that leaves none out."""
-    if len(frame.uv) <= most:
-        return None
-    likely = np.flatnonzero(frame.p_light >= np.partition(frame.p_light, -most)[-most])
+    least = LEAST_P_LIGHT
+    if len(frame.uv) > most:
+        least = max(least, float(np.partition(frame.p_light, -most)[-most]))
+    likely = np.flatnonzero(frame.p_light >= least)
     return likely if len(likely) < len(frame.uv) else None
 
 
@@ -221,8 +245,12 @@ def _rules(model: StationModel, prior: AttitudePrior, config: MatchConfig) -> Se
 
 
 def _log_clutter(frame: Measurements) -> Array:
-    """Log price (N + 1,) of assigning 0, 1, .. N detections instead of calling them clutter."""
-    return np.concatenate([[0.0], np.cumsum(frame.log_density + np.log(np.arange(len(frame.uv), 0, -1)))])
+    """Log price (N + 1,) of assigning 0, 1, .. N detections instead of calling them clutter.
+
+    A detection counts by what it looks like; that of a lamp counts fully.
+    """
+    left = weights(frame.p_light).sum() - np.arange(len(frame.uv))
+    return np.concatenate([[0.0], np.cumsum(frame.log_density + np.log(np.maximum(left, 1.0)))])
 
 
 def _search(task: _Search, problem: Problem, floor: int, *leasts: int, best: float = _NONE) -> tuple[Hypotheses, bool]:
@@ -285,38 +313,46 @@ def _odds(top: Hypothesis, best: float, found: Hypotheses, doubt: Doubt, crowdin
 def _kept(assignment: Indices, odds: Array, task: _Search) -> Indices:
     """The assignment (M,) without what is not beyond doubt: single lights, and layers with too few of them.
 
-    The lights beyond doubt stay; where they are fewer than `enough`, the likeliest of the others fill up.
+    The lights beyond doubt stay; where they are fewer than four, the likeliest of the others fill up.
     """
     config, layer = task.config, task.model.layer
     likeliest = np.sort(odds)[::-1]
-    least = max(min(config.extra, float(likeliest[min(config.enough, len(odds)) - 1])), config.prune)
+    least = max(min(config.extra, float(likeliest[min(CHECKED_LIGHTS, len(odds)) - 1])), config.prune)
     kept = np.where(odds >= least, assignment, -1)
     count = np.bincount(layer[kept >= 0], minlength=task.model.n_layers)
-    weak = (count < config.min_layer) & (count < count.max())
+    weak = (count < LAYER_LIGHTS) & (count < count.max())
     return np.where(weak[layer], -1, kept)
 
 
-def _crowding(assignment: Indices, frame: Measurements, task: _Search) -> tuple[int, float]:
+def _crowding(assignment: Indices, frame: Measurements, task: _Search) -> tuple[float, float]:
     """How many unassigned detections stand around the assigned ones, and how much denser, as a logarithm >= 0, ...
 
-    ... they stand there than the evidence has it.
+    ... they stand there than the evidence has it. Each counts by how much it looks like a lamp.
     """
     used, lens = frame.uv[assignment[assignment >= 0]], task.model.lights.lens
     low, high = used.min(axis=0), used.max(axis=0)
     low, high = low - _AROUND * (high - low), high + _AROUND * (high - low)
-    unassigned = int(((frame.uv >= low) & (frame.uv <= high)).all(axis=1).sum()) - len(used)
+    near = ((frame.uv >= low) & (frame.uv <= high)).all(axis=1)
+    near[assignment[assignment >= 0]] = False
+    unassigned = float(weights(frame.p_light)[near].sum())
     local = (unassigned + 0.5) / (float((high - low).prod()) + 1.0)
     return unassigned, max(0.0, math.log(local * lens[6] * lens[7] / task.config.spurious))
 
 
-def _mirror_evidence(task: _Search, top: Hypothesis) -> float:
-    """Log evidence, prior included, that the water's surface shows the array: only where it stands above the camera."""
-    n = top.n_assigned
-    found, complete = _search(task, task.mirrored(), n, min(n, CHECKED_LIGHTS), best=top.log_evidence)
-    if not complete:
-        return top.log_evidence
-    camera_y = -np.einsum("ki,ki->k", found.R[:, :, 1], found.t)
-    return float(np.logaddexp.reduce([_NONE, *found.log_evidence[camera_y < 0.0]])) + task.config.log_mirror
+def _mirror_evidence(task: _Search, top: Hypothesis, *, all_mirrors: bool) -> float:
+    """Log evidence, prior included, that a mirror shows the array.
+
+    The water's surface does only where the image stands above the camera; a floor or a wall may do so anywhere.
+    """
+    n, total = top.n_assigned, _NONE
+    for mirror in (_LEVEL, _UPRIGHT) if all_mirrors else (_LEVEL,):
+        found, complete = _search(task, task.mirrored(mirror), n, min(n, CHECKED_LIGHTS), best=top.log_evidence)
+        if not complete:
+            return top.log_evidence
+        camera_y = -np.einsum("ki,ki->k", found.R[:, :, 1], found.t)
+        possible = (camera_y < 0.0) | all_mirrors
+        total = float(np.logaddexp.reduce([total, *found.log_evidence[possible]]))
+    return total + task.config.log_mirror
 
 
 def conflicts(assignment: Indices, others: Indices) -> np.ndarray:

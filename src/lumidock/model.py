@@ -13,10 +13,13 @@ from lumidock._kernels.tracking.track import Lights
 from lumidock.camera import Camera
 from lumidock.config import MatchConfig, PriorConfig
 from lumidock.datatypes import Array, Attitude, Detections, Indices
+from lumidock.light_counts import MAX_SUBSETS
 from lumidock.station import Station
 
 _HEAD_ON = np.diag([1.0, -1.0, -1.0])  # R_dock_cam of a camera that looks straight into the dock
 _P_LAMP, _P_USUAL = 0.5, 0.15  # p_light above which a detection counts as a lamp; under which its centroid is doubtful
+LEAST_P_LIGHT = 0.01  # a detection that is less likely a lamp leaves every answer as if it were not there
+_IMPOSSIBLE = -1e9  # log likelihood ratio
 _MOST_RADIUS_PX = 3.0  # px; of a detection without a radius, and the most that makes a doubtful centroid worse
 _FLAT = 0.05  # a layer less thick than this share of its width is a plane
 
@@ -39,6 +42,7 @@ class StationModel:
     """A station of M lights in L layers and the camera that sees it.
 
     `lights`: lens, positions m and beam axes. `layer` (M,) of each light; `is_rear` (L,) 1 for the rearmost layer.
+    `group` (M,): the light, or the group of many, that one state of the bank is blind to.
     `survey_m2` (M,): variance m^2 of a position against the front layer. `planes` (L, 6): a point and the normal of
     each layer's plane, NaN for a layer with depth. `log_volume`: log of the volume m^3 of the view cone.
     `sigma_focal`: relative 1-sigma error of the focal length.
@@ -48,6 +52,7 @@ class StationModel:
     layer: Indices
     n_layers: int
     is_rear: Indices
+    group: Indices
     survey_m2: Array
     order: PairOrder
     planes: Array
@@ -85,6 +90,7 @@ def station_model(station: Station, camera: Camera, config: MatchConfig) -> Stat
         layer=station.layer,
         n_layers=len(station.layers),
         is_rear=((behind == len(front_first) - 1) & (behind > 0)).astype(np.int64),  # a lone layer is the front one
+        group=np.arange(len(station)) % MAX_SUBSETS,
         survey_m2=station.sigma_light_m**2 + (behind > 0)[station.layer] * 2.0 * station.sigma_layer_m**2,
         order=_pair_order(station),
         planes=_planes(station),
@@ -160,19 +166,32 @@ def measurements(detections: Detections, model: StationModel, config: MatchConfi
     p_light = np.array(detections.p_light, np.float64)
     frame = Measurements(uv, cov, np.empty(n), np.empty((n, model.n_layers)), p_light, 0.0)
     radius_px, p_rear = np.ascontiguousarray(detections.radius_px), np.ascontiguousarray(detections.p_rear)
-    looks = Appearance(config.label_trust, config.unlikely_radii, _MOST_RADIUS_PX, _P_USUAL)
-    span = weigh(radius_px, p_rear, model.is_rear, looks, frame)
+    appearance = Appearance(config.label_trust, config.unlikely_radii, _MOST_RADIUS_PX, _P_USUAL)
+    weigh(radius_px, p_rear, model.is_rear, appearance, frame)
+    ignored = p_light < LEAST_P_LIGHT
+    frame.like[ignored] = _IMPOSSIBLE
+    usual = uv[p_light >= _P_USUAL]
     lens, share = model.lights.lens, config.clutter_near
     whole = lens[6] * lens[7]
-    box = min(span + config.clutter_margin_px**2, whole) if n else whole
+    box = min(float(np.ptp(usual, axis=0).prod()) + config.clutter_margin_px**2, whole) if len(usual) else whole
     density = (1.0 - share) / whole + share / box
     log_density = math.log(density * config.spurious / (1.0 + config.spurious))
     return Measurements(uv, cov, frame.var, frame.like, p_light, log_density)
 
 
+def weights(p_light: Array) -> Array:
+    """How much each detection (N,) counts as clutter: one that is rather a lamp than not counts fully."""
+    return np.where(p_light < LEAST_P_LIGHT, 0.0, np.minimum(p_light / _P_LAMP, 1.0))
+
+
 def count_lamps(frame: Measurements) -> int:
     """How many detections are rather lamps than not."""
     return int(np.count_nonzero(frame.p_light >= _P_LAMP))
+
+
+def possible_lamps(detections: Detections) -> int:
+    """How many detections are not out of the question as lamps."""
+    return int(np.count_nonzero(~(detections.p_light < LEAST_P_LIGHT)))
 
 
 def light_of(assignment: Indices, n: int) -> Indices:

@@ -14,8 +14,10 @@ import numpy as np
 
 from lumidock._kernels.measurements import Measurements
 from lumidock._kernels.tracking import association
+from lumidock._kernels.tracking import bank as bank_kernel
 from lumidock._kernels.tracking import track as kernel
 from lumidock._kernels.tracking import update as update_kernel
+from lumidock._kernels.tracking.bank import Bank, BankRules
 from lumidock._kernels.tracking.track import FilterState, PredictedMeasurements
 from lumidock._kernels.tracking.update import Assigned, UpdateRules
 from lumidock.config import Config, TrackConfig
@@ -55,14 +57,13 @@ class LastSeen:
 class FrameResult:
     """What the last frame did to a track.
 
-    `assignment` (M,): the detection of each light or -1; `count`: lights with one by layer. `separations` (M, 18): what
-    leaving each light out would do, as in `_kernels.update`. `plane` (6,): the one that all of them lie on, NaN where
-    none. `nis`: normalised innovation squared; `deviate`: the same as a standard normal deviate.
+    `assignment` (M,): the detection of each light or -1; `count`: lights with one by layer. `plane` (6,): the
+    one that all of them lie on, NaN where none. `nis`: normalised innovation squared; `deviate`: the same as a standard
+    normal deviate.
     """
 
     assignment: Indices
     count: tuple[int, ...]
-    separations: Array
     plane: Array
     nis: float
     deviate: float
@@ -77,14 +78,15 @@ class FrameResult:
         """A frame in which no light has a detection."""
         m = len(model)
         nobody = np.full(m, -1, np.int64)
-        return cls(nobody, (0,) * model.n_layers, np.zeros((m, 18)), NO_PLANE, math.nan, 0.0)
+        return cls(nobody, (0,) * model.n_layers, NO_PLANE, math.nan, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
     """One hypothesis of the pose, followed over frames: its filter at `t_ns`, since `began_ns`.
 
-    `state`: pose, other states and their covariance (order in `_kernels.track`). `estimates_calibration`: lights of two
+    `state`: pose, other states and their covariance (order in `_kernels.track`). `bank`: for each light that was used
+    a state that never saw it. `estimates_calibration`: lights of two
     layers have been seen together. `log_weight`: log evidence since the track began. `agreeing_frames`: frames since
     the last failed test in which four lights agreed; none when they did so too long ago, since three fit many poses.
     `mean_deviate`: exponential mean of the innovation deviates, scaled to unit variance.
@@ -93,6 +95,7 @@ class Track:
     t_ns: int
     began_ns: int
     state: FilterState
+    bank: Bank
     seen: LastSeen
     last: FrameResult
     estimates_calibration: bool = False
@@ -140,6 +143,21 @@ def learned_calibration(track: Track) -> CalibrationStates:
     return CalibrationStates(x, P)
 
 
+def open_bank(model: StationModel) -> Bank:
+    """A bank in which no subset has begun."""
+    S, m, n = int(model.group.max()) + 1, len(model), kernel.LIGHTS + 3 * len(model)
+    none, nobody = np.full(S, -1, np.int64), np.zeros(m, np.int64)
+    return Bank(np.zeros((S, n)), np.empty((S, n, n)), np.zeros(S, np.int64), none, nobody, nobody, nobody)
+
+
+def _copied(bank: Bank) -> Bank:
+    """The same bank in arrays of its own; what has not begun takes no time."""
+    offset, P, *flags = bank
+    copied_P, begun = np.empty_like(P), np.flatnonzero(bank.begun)
+    copied_P[begun] = P[begun]
+    return Bank(offset.copy(), copied_P, *(values.copy() for values in flags))
+
+
 def open_states(calibration: CalibrationStates, config: TrackConfig) -> tuple[Array, Array]:
     """Values (n,) and covariance (n, n) of all states before the first light: of pose and twist nothing is known."""
     x, P = calibration.x.copy(), calibration.P.copy()
@@ -166,7 +184,8 @@ def start(
     state = FilterState(hypothesis.R.copy(), hypothesis.t.copy(), x, P)
     kernel.attitude_update(state, prior.R_dock_cam, 1.0 / prior.info, prior.measured)
     never = LastSeen(t_ns, _NEVER, (_NEVER,) * model.n_layers)
-    fresh = Track(t_ns, t_ns, state, never, FrameResult.nothing(model), log_weight=hypothesis.log_evidence)
+    nothing = FrameResult.nothing(model)
+    fresh = Track(t_ns, t_ns, state, open_bank(model), never, nothing, log_weight=hypothesis.log_evidence)
     first = _Start(hypothesis.R, hypothesis.t, None)
     begun = _update(fresh, hypothesis.assignment, frame, model, config, guess=first)
     for _ in range(_MAX_FLATTENINGS):
@@ -177,19 +196,22 @@ def start(
         begun = _update(fresh, hypothesis.assignment, frame, model, config, guess=flatter)
         if begun is not None and np.trace(begun.state.P[3:6, 3:6]) < _FLATTENED * np.trace(turn_cov):
             break
-    return begun
+    return None if begun is None else _bank_updated(fresh, begun, frame, model, config, starting=True)
 
 
 def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
     """The track at a later time, its twist held but for white noise on it; what agreed too long ago counts no more."""
     R, t, x, P = track.state
     state = FilterState(R.copy(), t.copy(), x, P.copy())
-    kernel.predict(state, (t_ns - track.t_ns) * 1e-9, config.accel_m_s2**2, config.accel_rad_s2**2)
+    bank, dt, q = _copied(track.bank), (t_ns - track.t_ns) * 1e-9, (config.accel_m_s2**2, config.accel_rad_s2**2)
+    kernel.predict(state, dt, *q)
+    bank_kernel.predict_bank(bank, state, dt, *q)
     lately = t_ns - track.seen.agreed_ns <= config.max_gap_s * 1e9
     return Track(
         t_ns=t_ns,
         began_ns=track.began_ns,
         state=state,
+        bank=bank,
         seen=track.seen,
         last=track.last,
         estimates_calibration=track.estimates_calibration,
@@ -206,8 +228,11 @@ def update_attitude(track: Track, attitude: Attitude) -> Track:
     if state.P[kernel.BIAS, kernel.BIAS] == 0.0:  # the track began without a sensor: its bias is as open as ever
         state.P[bias, bias] = np.eye(3) * attitude.sigma_rad**2
     var = np.full(3, attitude.sigma_rad**2)
-    kernel.attitude_update(state, np.ascontiguousarray(attitude.R_dock_cam), var, True)
-    return replace(track, state=state)
+    R_dock_cam, bank = np.ascontiguousarray(attitude.R_dock_cam), _copied(track.bank)
+    bank_kernel.attitude_bank(bank, state, R_dock_cam, var)
+    kernel.attitude_update(state, R_dock_cam, var, True)
+    bank_kernel.shift_bank(bank, track.state, state)
+    return replace(track, state=state, bank=bank)
 
 
 def predict_measurements(track: Track, model: StationModel) -> PredictedMeasurements:
@@ -235,11 +260,11 @@ def associate(
 
     `predicted`: what `predict_measurements` said of this track, where it has been asked.
 
-    A layer that was not in view enters with three lights or more, or not at all: where the tilt is open, clutter in the
-    wide gate of a single light would set it.
+    A layer that was not in view lately, for `max_age_s`, enters with three lights or more, or not at all: where the
+    tilt is open, clutter in the wide gate of a single light would set it.
     """
     predicted = predicted or predict_measurements(track, model)
-    lately = [track.t_ns - t_ns <= config.track.max_gap_s * 1e9 for t_ns in track.seen.layer_ns]
+    lately = [track.t_ns - t_ns <= config.integrity.max_age_s * 1e9 for t_ns in track.seen.layer_ns]
     if all(lately):
         return _associate(predicted, frame, model, config)
     known = np.array(lately)[model.layer]
@@ -293,9 +318,31 @@ def update(
 ) -> Track | None:
     """The track updated by the detections assigned, of this `log_evidence`; None where its pose does not settle.
 
-    From the first frame on that shows `joint_lights` lights of two layers, calibration and light positions move too.
+    From the first frame on that shows `LAYER_LIGHTS` lights of two layers, calibration and light positions move too.
     """
-    return _update(track, assignment, frame, model, config, log_evidence=log_evidence)
+    updated = _update(track, assignment, frame, model, config, log_evidence=log_evidence)
+    return None if updated is None else _bank_updated(track, updated, frame, model, config, starting=False)
+
+
+def _bank_updated(
+    before: Track, after: Track, frame: Measurements, model: StationModel, config: TrackConfig, *, starting: bool
+) -> Track:
+    """The updated track with its bank updated too, which is still that of the track `before`."""
+    bank, seen = _copied(before.bank), Assigned(after.last.assignment, frame.uv, frame.cov)
+    rules = BankRules(
+        group=model.group,
+        layer=model.layer,
+        planes=model.planes,
+        estimated=len(after.state.x) if after.estimates_calibration else kernel.CALIBRATION,
+        depth_known=after.estimates_calibration,
+        starting=starting,
+        turn_cov=after.state.P[3:6, 3:6].copy(),
+        proven_m=config.proven_m,
+    )
+    bank_kernel.begin_subsets(bank, before.state, after.last.assignment, model.group)
+    bank_kernel.shift_bank(bank, before.state, after.state)
+    bank_kernel.update_bank(model.lights, after.state, seen, rules, bank)
+    return replace(after, bank=bank)
 
 
 def _update(
@@ -310,7 +357,7 @@ def _update(
 ) -> Track | None:
     """The filter's update, linearised first at a `guess`, or at the prediction where there is none."""
     count = model.count(assignment)
-    both = track.estimates_calibration or sees_two_layers(count, config)
+    both = track.estimates_calibration or sees_two_layers(count)
     R0, t0, x, P = track.state
     state = FilterState(R0.copy(), t0.copy(), x.copy(), P.copy())
     turn_cov, plane = P[3:6, 3:6].copy(), _plane(track, count, model)
@@ -324,18 +371,19 @@ def _update(
         plane=NO_PLANE if guess and guess.turn_cov is None else plane,
         turn_cov=turn_cov,
     )
-    separations, seen = np.zeros((len(model), 18)), Assigned(assignment, frame.uv, frame.cov)
-    nis = update_kernel.update(model.lights, track.state, state, seen, rules, separations)
+    seen = Assigned(assignment, frame.uv, frame.cov)
+    nis = update_kernel.update(model.lights, track.state, state, seen, rules)
     if not math.isfinite(nis):
         return None
     # a pose of which nothing was known takes up six of the pixels' degrees of freedom
     deviate = _deviate(nis, 2 * sum(count) - (6 if guess else 0))
-    result = FrameResult(assignment, count, separations, plane, nis, deviate)
+    result = FrameResult(assignment, count, plane, nis, deviate)
     seen_now = _seen(track, count)
     return Track(
         t_ns=track.t_ns,
         began_ns=track.began_ns,
         state=state,
+        bank=track.bank,
         seen=seen_now,
         last=result,
         estimates_calibration=both,
@@ -376,9 +424,9 @@ def _plane(track: Track, count: tuple[int, ...], model: StationModel) -> Array:
     return model.planes[count.index(most)] if alone else NO_PLANE
 
 
-def sees_two_layers(count: tuple[int, ...], config: TrackConfig) -> bool:
+def sees_two_layers(count: tuple[int, ...]) -> bool:
     """Whether at least two layers show enough lights, `count` by layer, to tell survey and calibration from pose."""
-    return sum(c >= config.joint_lights for c in count) >= 2
+    return sum(c >= LAYER_LIGHTS for c in count) >= 2
 
 
 def same(a: Track, b: Track) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lumidock import track
+from lumidock import track, verify
 from lumidock._kernels.measurements import Measurements
 from lumidock._kernels.tracking.track import PredictedMeasurements
 from lumidock.datatypes import Array, Attitude
@@ -57,6 +57,22 @@ def _is_tracked(state: LocalizerState, t_ns: int) -> bool:
     if not state.confirmed or state.failures or state.last is None:
         return False
     return state.last.t_ns <= state.first.t_ns < t_ns
+
+
+def is_frozen(state: LocalizerState, predicted: Prediction, frame: Measurements, context: Context) -> bool:
+    """Whether the frame is the picture before again, though the confirmed track moves or that one was frozen too."""
+    before = state.last
+    if before is None or not verify.repeats(frame, before.uv):
+        return False
+    if state.frozen:
+        return True
+    if not (state.confirmed and predicted.tracks):
+        return False
+    one = predicted.tracks[0]
+    if one.last.n_used == 0 or one.last.assignment.max() >= len(before):
+        return False
+    expected = predicted.measurements or track.predict_measurements(one, context.model)
+    return verify.moves(one, expected, before.uv, math.sqrt(float(frame.var.mean())))
 
 
 def follow(predicted: Prediction, frame: Measurements, context: Context, *, confirmed: bool) -> tuple[Track, ...]:

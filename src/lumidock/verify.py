@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
+from lumidock._kernels.measurements import Measurements
+from lumidock._kernels.tracking.track import CALIBRATION, LIGHTS, TWIST, PredictedMeasurements
 from lumidock.config import Config, IntegrityConfig, MatchConfig, TrackConfig
-from lumidock.datatypes import Indices
+from lumidock.datatypes import Array, Indices
 from lumidock.light_counts import CHECKED_LIGHTS, JOINT_TRACK_LIGHTS, POSE_LIGHTS
 from lumidock.match import Acquisition, conflicts
 from lumidock.track import Track
+
+_REPEATED_SHARE, _REPEATED_SIGMAS = 0.7, 0.15  # of the detections, rms a coordinate: two draws of noise differ by 1.4
+_MOVES_M_S, _MOVES_RAD_S = 0.1, 0.02  # faster is not hovering
+_MOVED_SIGMAS = 0.3  # rms a coordinate that the lights are expected to have moved: twice what counts as a repetition
+_TOLD_SHARE = 0.02  # of a prior variance: with less taken out the test rests on linearisation
+_CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 
 
 def innovation_holds(track: Track, config: TrackConfig) -> bool:
@@ -40,6 +49,40 @@ def is_answer(found: Acquisition, config: MatchConfig) -> bool:
     return enough and found.margin > config.margin
 
 
+def agrees(found: Acquisition, assignment: Indices, config: MatchConfig) -> bool:
+    """Whether an acquisition gives four lights the same detections as an association, and none another."""
+    if not is_answer(found, config):
+        return False
+    fresh = found.hypotheses[0].assignment
+    same = int(((fresh == assignment) & (fresh >= 0)).sum())
+    return same >= CHECKED_LIGHTS and not contradict(fresh, assignment)
+
+
+def repeats(frame: Measurements, before: Array) -> bool:
+    """Whether a picture is the one `before` again, of centroids (N, 2) px.
+
+    Noise never repeats: most centroids within a fraction of their sigma come from a camera or decoder that hangs.
+    """
+    least = max(POSE_LIGHTS, math.ceil(_REPEATED_SHARE * len(frame.uv)))
+    if len(before) == 0 or len(frame.uv) < least:
+        return False
+    apart = np.linalg.norm(frame.uv[:, None] - before[None], axis=2).min(axis=1) / np.sqrt(frame.var)
+    nearest = np.sort(apart)[:least]
+    return math.sqrt(0.5 * float((nearest**2).mean())) < _REPEATED_SIGMAS
+
+
+def moves(track: Track, expected: PredictedMeasurements, before: Array, sigma_px: float) -> bool:
+    """Whether a track is not hovering and expects its lights elsewhere in the image than the frame `before` had them.
+
+    The track was updated by that frame, of centroids (N, 2) px and noise `sigma_px`; `expected` is where they are now.
+    """
+    twist, used = track.state.x[TWIST : TWIST + 6], np.flatnonzero(track.last.assignment >= 0)
+    if np.linalg.norm(twist[:3]) < _MOVES_M_S and np.linalg.norm(twist[3:]) < _MOVES_RAD_S:
+        return False
+    moved = expected.uv[used] - before[track.last.assignment[used]]
+    return math.sqrt(float((moved**2).mean())) > _MOVED_SIGMAS * sigma_px
+
+
 def stands_out(tracks: Sequence[Track], found: Acquisition, config: Config) -> bool:
     """Whether the first of several hypotheses followed over frames has left all others, and clutter, far behind.
 
@@ -56,6 +99,24 @@ def stands_out(tracks: Sequence[Track], found: Acquisition, config: Config) -> b
     rivals = [other.log_weight for other in tracks[1:] if contradict(assignment, other.last.assignment)]
     against = float(np.logaddexp.reduce([-config.match.log_dock, *rivals]))
     return first.log_weight - against > config.match.margin_gathered
+
+
+def contradicted_file(track: Track, prior_var: Array) -> tuple[str, int]:
+    """What the lights have taught against the files: `calibration` or `survey`, and which state; nothing: ("", -1).
+
+    Of each calibration state the square over the variance that the lights have taken out of its prior (n,), chi-square
+    of one degree of freedom while the files hold (a score test). It counts where they have taken out enough to tell.
+    """
+    if not track.estimates_calibration:
+        return "", -1
+    x, var = track.state.x[CALIBRATION:], np.diagonal(track.state.P)[CALIBRATION:]
+    prior = prior_var[CALIBRATION:]
+    told = prior - var
+    test = np.where(told > _TOLD_SHARE * prior, x**2 / np.maximum(told, 1e-300), 0.0)
+    worst = int(test.argmax())
+    if test[worst] < _CONTRADICTION:
+        return "", -1
+    return ("calibration" if worst < LIGHTS - CALIBRATION else "survey"), worst + CALIBRATION
 
 
 def contradict(a: Indices, b: Indices) -> bool:

@@ -1,7 +1,8 @@
 """The best accuracy that the lights in view allow: the filter's covariance along the true path, with true identities.
 
 A recursive Cramer-Rao bound (P. Tichavsky, C. Muravchik, A. Nehorai, 1998) under the filter's own noise, priors and
-history. Where it is inside the alert limits with a margin, a good method gives a valid fix.
+history, with the same protection against one wrong light. Where it is inside the alert limits with a margin, a good
+method gives a valid fix.
 """
 
 from __future__ import annotations
@@ -12,14 +13,15 @@ import numpy as np
 
 from lumidock import track
 from lumidock._kernels.tracking import track as kernel
-from lumidock._kernels.tracking.levels import SigmaFactors, protection_levels
+from lumidock._kernels.tracking.bank import BankRules, begin_subsets, predict_bank, update_bank
+from lumidock._kernels.tracking.levels import Groups, protection_levels
 from lumidock._kernels.tracking.track import FilterState
 from lumidock._kernels.tracking.update import Assigned, UpdateRules, update
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Indices
 from lumidock.geometry import se3_inverse
-from lumidock.integrity import sigma_factors
+from lumidock.integrity import fault_factors
 from lumidock.light_counts import CHECKED_LIGHTS, LAYER_LIGHTS
 from lumidock.model import attitude_prior, station_model
 from lumidock.pose import project_lights
@@ -35,8 +37,8 @@ class Bound:
         self.station, self.camera, self.config, self.cold = station, camera, config, cold
         self._model = station_model(station, camera, config.match)
         self._prior = attitude_prior(None, config.prior)
-        factors = sigma_factors(config.integrity.risk)
-        self._factors = SigmaFactors(factors, factors, False)
+        self._declared = track.calibration_prior(station, None)
+        self._no_planes = np.full_like(self._model.planes, np.nan)  # the true tilt is known
         self.forget()
 
     def forget(self) -> None:
@@ -67,8 +69,16 @@ class Bound:
             return None
         if t_ns - self._agreed_ns > self.config.track.max_gap_s * 1e9:
             return None  # three lights fit many poses
-        nothing, state = np.zeros((len(self.station), 18)), self._at(R, t)
-        return np.array(protection_levels(state, nothing, track.NO_PLANE, self._factors, np.empty((9, 9)))[:3])
+        factors = fault_factors(int(self._bank.used.sum()), self.config.integrity)
+        levels = protection_levels(
+            self._at(R, t),
+            track.NO_PLANE,
+            self._bank,
+            Groups(self._model.group, self._no_planes),
+            factors,
+            np.empty((9, 9)),
+        )
+        return np.array(levels[:3])
 
     def _at(self, R: Array, t: Array) -> FilterState:
         """The filter on the true pose `R`, `t` of T_cam_dock; its covariance is shared, and changes in place."""
@@ -85,14 +95,17 @@ class Bound:
         return lateral < lateral_m and axial < axial_m and angle < angle_rad and math.isfinite(lateral)
 
     def _start(self, R: Array, t: Array) -> Array:
-        x, P = track.open_states(track.calibration_prior(self.station, None), self.config.track)
+        x, P = track.open_states(self._declared, self.config.track)
         state = FilterState(R.copy(), t.copy(), x, P)
         kernel.attitude_update(state, self._prior.R_dock_cam, 1.0 / self._prior.info, False)
+        self._bank = track.open_bank(self._model)
         return P
 
     def _predict(self, R: Array, t: Array, dt: float) -> None:
         config = self.config.track
-        kernel.predict(self._at(R, t), dt, config.accel_m_s2**2, config.accel_rad_s2**2)
+        q = config.accel_m_s2**2, config.accel_rad_s2**2
+        kernel.predict(self._at(R, t), dt, *q)
+        predict_bank(self._bank, self._at(R, t), dt, *q)
 
     def _update(self, R: Array, t: Array, T_dock_cam: Array, lights: Indices) -> None:
         """Exact pixels of the lights: the mean stays where it is, and the covariance shrinks.
@@ -106,7 +119,7 @@ class Bound:
         assignment[lights] = np.arange(len(lights))
         uv = project_lights(self.camera, T_dock_cam, self.station.p_dock[lights])
         cov = np.tile(np.eye(2) * self.config.match.noise_px**2, (len(lights), 1, 1))
-        self._joint = self._joint or track.sees_two_layers(self._model.count(assignment), self.config.track)
+        self._joint = self._joint or track.sees_two_layers(self._model.count(assignment))
         state = self._at(R, t)
         rules = UpdateRules(
             estimated=len(state.P) if self._joint else kernel.CALIBRATION,
@@ -115,5 +128,17 @@ class Bound:
             plane=track.NO_PLANE,
             turn_cov=np.eye(3),
         )
-        separations = np.zeros((len(assignment), 18))
-        update(self._model.lights, self._at(R, t), state, Assigned(assignment, uv, cov), rules, separations)
+        seen = Assigned(assignment, uv, cov)
+        begin_subsets(self._bank, state, assignment, self._model.group)
+        update(self._model.lights, self._at(R, t), state, seen, rules)
+        bank_rules = BankRules(
+            group=self._model.group,
+            layer=self._model.layer,
+            planes=self._no_planes,
+            estimated=rules.estimated,
+            depth_known=True,
+            starting=False,
+            turn_cov=np.eye(3),
+            proven_m=self.config.track.proven_m,
+        )
+        update_bank(self._model.lights, self._at(R, t), seen, bank_rules, self._bank)

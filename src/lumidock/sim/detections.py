@@ -7,7 +7,7 @@ Shapes: N frames, G runs, M lights, S detections.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,6 +18,7 @@ from lumidock.pose import project_lights
 from lumidock.sim.course import Course, course_of, mirror_image, project_each, shines
 from lumidock.sim.draws import Draw
 from lumidock.sim.measured import Appearance, DetectionTable, as_measured, detector_errors, with_false
+from lumidock.sim.point_faults import bent, glints, seen_glints
 from lumidock.sim.scenario import BlackOuts, Scenario, rotations, spurious_paths
 from lumidock.station import Station
 
@@ -84,11 +85,16 @@ def simulated_frames(scenario: Scenario, station: Station, camera: Camera, seed:
     """
     course = course_of(scenario, station, camera, np.random.default_rng([seed, Draw.COURSE]))
     drawn = run_draws(scenario, station, course, np.random.default_rng([seed, Draw.RUN]))
+    bent_p = bent(scenario.detections, drawn.p_dock, np.random.default_rng([seed, Draw.BENT_LIGHT]))
+    drawn = replace(drawn, p_dock=bent_p)
+    places = glints(scenario.detections, drawn.p_dock, drawn.dead, np.random.default_rng([seed, Draw.STRUCTURE_GLINTS]))
     wander = _wandering(scenario, camera, course, np.random.default_rng([seed, Draw.WANDERING_LIGHTS]))
     rng = np.random.default_rng([seed, Draw.DETECTIONS])
     uv, visible, range_m = _in_view_of_each(scenario, station, camera, course, drawn)
     lit = visible & ~_dark(scenario, station, course, drawn, visible, rng)
     spurious = _spurious(scenario, drawn, wander, _box(scenario, camera, uv, visible), rng)
+    fixed = seen_glints(scenario.detections, camera, course, places, drawn.black)
+    spurious = np.concatenate([spurious[0], fixed[0]]), np.concatenate([spurious[1], fixed[1]])
     errors = detector_errors(scenario.detections.detector) if scenario.detections.detector else None
     detector_rng = np.random.default_rng([seed, Draw.DETECTOR_ERRORS])
     if errors:
@@ -209,7 +215,10 @@ def _dark(
     count = rng.integers(*scenario.faults.missing, len(visible), endpoint=True)
     missing = _random_choice(visible & front, count, rng)[course.missing_from]
     dropped = rng.random(visible.shape) < scenario.detections.drop
-    off = failed(scenario, station, course.t_ns * 1e-9)
+    t_s = course.t_ns * 1e-9
+    off = failed(scenario, station, t_s)
+    for first, last in scenario.detections.front_off_s:
+        off |= front & ((t_s >= first) & (t_s <= last))[:, None]
     return np.asarray(missing | dropped | drawn.dead[course.run] | drawn.black[:, None] | off)
 
 

@@ -24,5 +24,7 @@ class Draw(IntEnum):
     SNOW = 13
     FISH = 14
     DETECTOR_ERRORS = 15
+    BENT_LIGHT = 16
+    STRUCTURE_GLINTS = 17
     HOT_PIXELS = 20
     JELLYFISH = 21

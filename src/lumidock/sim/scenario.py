@@ -138,6 +138,10 @@ class DetectionKnobs(KnobSection):
     dock: bool = True  # whether there is a dock
     mirror: Literal["none", "only"] = "none"  # only: the mirror image in the water surface is seen, not the dock
     surface_m: Lengths = (1.0, 4.0)  # height of the water surface above the dock's origin
+    glints: Counts = (0, 0)  # number of glints fixed to the structure beside lamps, those of dead lamps first
+    glint_m: Lengths = (0.05, 0.15)  # distance of a glint from its lamp
+    bent_m: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0  # by which one light is off its surveyed position
+    front_off_s: tuple[Interval, ...] = ()  # times since the start in which the front layer is dark
     survey: bool = False  # whether lights are displaced by errors of the station's survey_sigma
     calibration: bool = False  # whether the lens has errors of the station's calibration_sigma
     black_outs: BlackOuts = BlackOuts()

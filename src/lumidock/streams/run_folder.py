@@ -1,4 +1,4 @@
-"""The run folder: fixes, lights, layers, trajectory and run.json, whole rows only whenever a run is killed."""
+"""The run folder: fixes, lights, layers, alternatives, trajectory, run.json; whole rows whenever a run is killed."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ FIX_COLUMNS = (
 )
 LIGHT_COLUMNS = ("frame", "u_px", "v_px", "radius_px", "flux", "p_light", "p_rear", "light")
 LAYER_COLUMNS = ("frame", "layer", "n_used", "matched_by", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-_FILES = ("fixes.csv", "lights.csv", "layers.csv", "trajectory.tum", "run.json")
+ALTERNATIVE_COLUMNS = ("frame", "rank", "probability", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+_FILES = ("fixes.csv", "lights.csv", "layers.csv", "alternatives.csv", "trajectory.tum", "run.json")
 _MOST_HASHED = 1 << 24  # bytes; of a larger file only samples are
 _SAMPLES, _SAMPLE = 64, 1 << 16
 
@@ -52,10 +53,11 @@ class RunFolder:
         for name in _FILES:
             (folder / name).unlink(missing_ok=True)
         # unbuffered: a row is in the file, whole, or it is not
-        self._files = {name: (folder / name).open("wb", buffering=0) for name in _FILES[:4]}
+        self._files = {name: (folder / name).open("wb", buffering=0) for name in _FILES[:5]}
         self._write("fixes.csv", [FIX_COLUMNS])
         self._write("lights.csv", [LIGHT_COLUMNS])
         self._write("layers.csv", [LAYER_COLUMNS])
+        self._write("alternatives.csv", [ALTERNATIVE_COLUMNS])
 
     def __enter__(self) -> Self:
         return self
@@ -75,6 +77,13 @@ class RunFolder:
         self._write(
             "layers.csv",
             ([fix.frame, p.layer, p.n_used, p.source, *_pose_fields(p.T_dock_cam)] for p in fix.by_layer),
+        )
+        self._write(
+            "alternatives.csv",
+            (
+                [fix.frame, rank, _short(one.probability), *_pose_fields(one.T_dock_cam)]
+                for rank, one in enumerate(fix.alternatives, start=1)
+            ),
         )
         if fix.T_dock_cam is not None:
             line = " ".join([_seconds(fix.t_ns), *_pose_fields(fix.T_dock_cam)])

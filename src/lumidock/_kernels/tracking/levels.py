@@ -8,22 +8,30 @@ from typing import NamedTuple
 import numpy as np
 
 from lumidock._kernels.compiling import entry, part
+from lumidock._kernels.tracking.bank import Bank, all_proven
 from lumidock._kernels.tracking.slant import tilt_of
 from lumidock._kernels.tracking.track import FilterState
-from lumidock.datatypes import Array
+from lumidock.datatypes import Array, Indices
 
-_TILT_SIGMAS = 2.5  # of a plane's tilt, for what its square does to the range
+_TILT_SHARE = 0.51  # of the factor on sigma, for what the square of a plane's tilt does to the range: 2.5 sigma at 1e-6
 
 
 class SigmaFactors(NamedTuple):
-    """Factors (3,) on sigma, in one, two and three dimensions, without a fault and with one light at fault.
+    """Factors (3,) on sigma, in one, two and three dimensions.
 
-    With `separate` every light may be at fault.
+    Without a fault; with one light at fault that geometry has not proven; and with one that it has.
     """
 
     fault_free: Array
-    one_fault: Array
-    separate: bool
+    unproven: Array
+    proven: Array
+
+
+class Groups(NamedTuple):
+    """The subset that is blind to each light, `group` (M,), and the `planes` (L, 6) of the layers."""
+
+    group: Indices
+    planes: Array
 
 
 @part
@@ -71,42 +79,63 @@ def _largest3(A: Array) -> float:
 
 @entry
 def protection_levels(
-    state: FilterState, separations: Array, plane: Array, factors: SigmaFactors, cov: Array
+    state: FilterState, plane: Array, bank: Bank, groups: Groups, factors: SigmaFactors, cov: Array
 ) -> tuple[float, float, float, float, float]:
     """Protection levels: lateral m, axial m, angle rad, bearing rad, range m; `cov` (9, 9) of `outputs` is filled.
 
-    `separations` (M, 18) as in `update`: what leaving each light out moves, and the variance that it adds. A tilted
-    `plane` (6,) looks smaller by the square of its tilt: range and axial levels have room for what the tilt's spread
+    The filter's own, on the `plane` (6,) of its last lights, and that of every state of the `bank` that is blind to a
+    light: how far it is off the filter and what it may be off itself.
+    """
+    C = outputs(state.R, state.t)
+    level, other, apart, theirs = np.zeros(5), np.empty(5), np.zeros(9), np.empty((9, 9))
+    nowhere = np.full(6, np.nan)
+    _levels(state, C, state.P, plane, apart, factors.fault_free, cov, level)
+    for s in range(len(bank.begun)):
+        if bank.begun[s] == 0:
+            continue
+        for i in range(9):
+            apart[i] = 0.0
+            for k in range(6):
+                apart[i] += C[i, k] * bank.offset[s, k]
+        flat = groups.planes[bank.plane[s]] if bank.plane[s] >= 0 else nowhere
+        k_fault = factors.proven if all_proven(bank, groups.group, s) else factors.unproven
+        _levels(state, C, bank.P[s], flat, apart, k_fault, theirs, other)
+        for i in range(5):
+            level[i] = max(level[i], other[i])
+    return level[0], level[1], level[2], level[3], level[4]
+
+
+@part
+def _levels(
+    state: FilterState, C: Array, P: Array, plane: Array, apart: Array, k: Array, cov: Array, level: Array
+) -> None:
+    """Fill the five levels (5,) of a pose of covariance `P` whose outputs `C` (9, 6) are `apart` (9,) off; and `cov`.
+
+    A tilted plane looks smaller by the square of its tilt: range and axial levels have room for what the tilt's spread
     can do to them.
     """
-    R, t, P, k_free, k_fault = state.R, state.t, state.P, factors.fault_free, factors.one_fault
-    C = outputs(R, t)
+    CP = np.zeros((9, 6))
+    for i in range(9):
+        for m in range(6):
+            for n in range(6):
+                CP[i, n] += C[i, m] * P[m, n]
     for i in range(9):
         for j in range(i + 1):
             s = 0.0
-            for k in range(6):
-                for n in range(6):
-                    s += C[i, k] * P[k, n] * C[j, n]
+            for n in range(6):
+                s += CP[i, n] * C[j, n]
             cov[i, j] = cov[j, i] = s
-    lateral, axial, angle = _largest2(cov[0, 0], cov[0, 1], cov[1, 1]), cov[2, 2], _largest3(cov)
-    bearing, distance = _largest2(cov[6, 6], cov[6, 7], cov[7, 7]), cov[8, 8]
-    pl0, pl1, pl2 = k_free[1] * math.sqrt(lateral), k_free[0] * math.sqrt(axial), k_free[2] * math.sqrt(angle)
-    pl3, pl4 = k_free[1] * math.sqrt(bearing), k_free[0] * math.sqrt(distance)
-    if factors.separate:
-        for c in range(len(separations)):
-            a = separations[c]
-            if a[9] == 0.0 and a[10] == 0.0:
-                continue
-            pl0 = max(pl0, math.hypot(a[0], a[1]) + k_fault[1] * math.sqrt(lateral + a[9] + a[10]))
-            pl1 = max(pl1, abs(a[2]) + k_fault[0] * math.sqrt(axial + a[11]))
-            turn = math.sqrt(a[3] * a[3] + a[4] * a[4] + a[5] * a[5])
-            pl2 = max(pl2, turn + k_fault[2] * math.sqrt(angle + a[12] + a[13] + a[14]))
-            pl3 = max(pl3, math.hypot(a[6], a[7]) + k_fault[1] * math.sqrt(bearing + a[15] + a[16]))
-            pl4 = max(pl4, abs(a[8]) + k_fault[0] * math.sqrt(distance + a[17]))
+    lateral, bearing = _largest2(cov[0, 0], cov[0, 1], cov[1, 1]), _largest2(cov[6, 6], cov[6, 7], cov[7, 7])
+    level[0] = math.hypot(apart[0], apart[1]) + k[1] * math.sqrt(lateral)
+    level[1] = abs(apart[2]) + k[0] * math.sqrt(cov[2, 2])
+    turned = math.sqrt(apart[3] ** 2 + apart[4] ** 2 + apart[5] ** 2)
+    level[2] = turned + k[2] * math.sqrt(_largest3(cov))
+    level[3] = math.hypot(apart[6], apart[7]) + k[1] * math.sqrt(bearing)
+    level[4] = abs(apart[8]) + k[0] * math.sqrt(cov[8, 8])
     if not math.isnan(plane[0]):
         q, axis = np.empty(3), np.empty(3)
-        tilt, sigma = tilt_of(R, t, plane, P[3:6, 3:6].copy(), q, axis)
-        far = tilt + _TILT_SIGMAS * sigma
+        tilt, sigma = tilt_of(state.R, state.t, plane, P[3:6, 3:6].copy(), q, axis)
+        far = tilt + _TILT_SHARE * k[0] * sigma
         shrunk = 0.25 * (far * far - tilt * tilt) * math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
-        pl1, pl4 = pl1 + shrunk, pl4 + shrunk
-    return pl0, pl1, pl2, pl3, pl4
+        level[1] += shrunk
+        level[4] += shrunk

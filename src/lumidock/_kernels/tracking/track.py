@@ -62,7 +62,6 @@ def predict(state: FilterState, dt: float, q_lin: float, q_ang: float) -> None:
     `q_lin` (m/s)^2/s and `q_ang` (rad/s)^2/s are the variances that each second adds to the twist.
     """
     R, t, x, P = state
-    n = len(P)
     back = np.eye(3)
     vx, vy, vz, wx, wy, wz = x[TWIST], x[TWIST + 1], x[TWIST + 2], x[TWIST + 3], x[TWIST + 4], x[TWIST + 5]
     rotate_exp(back, -dt * wx, -dt * wy, -dt * wz)
@@ -76,7 +75,13 @@ def predict(state: FilterState, dt: float, q_lin: float, q_ang: float) -> None:
             moved[i] += back[i, k] * t[k]
             turned[i, k] = back[i, 0] * R[0, k] + back[i, 1] * R[1, k] + back[i, 2] * R[2, k]
     set_pose(R, t, turned, moved)
-    A = _adjoint(R, t)
+    move_covariance(P, adjoint(R, t), dt, q_lin, q_ang)
+
+
+@part
+def move_covariance(P: Array, A: Array, dt: float, q_lin: float, q_ang: float) -> None:
+    """Move the first rows of a covariance, `P` (12 or more, n), on by `dt` s, in place; `A` (6, 6) as in `adjoint`."""
+    rows, n = P.shape
     AP = np.zeros((6, n))
     for i in range(6):
         for k in range(6):
@@ -87,7 +92,7 @@ def predict(state: FilterState, dt: float, q_lin: float, q_ang: float) -> None:
     for i in range(6):  # F P F^T with F = I + B, B = -dt A from twist to pose
         for j in range(n):
             P[i, j] += AP[i, j]
-    for j in range(n):
+    for j in range(rows):
         for i in range(6):
             s = 0.0
             for k in range(6):
@@ -105,7 +110,7 @@ def predict(state: FilterState, dt: float, q_lin: float, q_ang: float) -> None:
 
 
 @part
-def _adjoint(R: Array, t: Array) -> Array:
+def adjoint(R: Array, t: Array) -> Array:
     """Adjoint (6, 6) of T_dock_cam from `R`, `t` of T_cam_dock."""
     A = np.zeros((6, 6))
     d = np.empty(3)

@@ -1,4 +1,4 @@
-"""The filter's update: all assigned detections of a frame at once, and what leaving each light out would do."""
+"""The filter's update: all assigned detections of a frame at once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from lumidock._kernels.compiling import entry, part
 from lumidock._kernels.lens import copy_to, factor
 from lumidock._kernels.matching.evidence import assigned_lights
 from lumidock._kernels.pose import set_pose
-from lumidock._kernels.tracking.levels import outputs
 from lumidock._kernels.tracking.slant import flatten
 from lumidock._kernels.tracking.track import FilterState, Lights, apply, difference, dot_row, gains, row
 from lumidock.datatypes import Array, Indices
@@ -57,17 +56,12 @@ class _Rows(NamedTuple):
 
 
 @entry
-def update(
-    station: Lights, predicted: FilterState, state: FilterState, seen: Assigned, rules: UpdateRules, separations: Array
-) -> float:
+def update(station: Lights, predicted: FilterState, state: FilterState, seen: Assigned, rules: UpdateRules) -> float:
     """Update `state` by all assigned detections at once, in place; the NIS, NaN on failure.
 
     The pose of `predicted` is the one that `P` belongs to, that of `state` where to linearise first. Seen at a slant by
     mistake, a plane would seem to tell its tilt: so of a single plane the covariance is that of the flattest view; when
     `tracking` the gain is too, so that history rests on perspective and not on the choice between two slants.
-
-    `separations` (M, 18): for each assigned light, how far the nine `outputs` would move without it, and the variance
-    that leaving it out adds to each.
     """
     R0, t0, (R, t, x, P) = predicted.R, predicted.t, state
     plane, turn_cov, tracking, estimated = rules.plane, rules.turn_cov, rules.tracking, rules.estimated
@@ -86,7 +80,7 @@ def update(
         if slanted and tracking and not _reproject(station, state, rows):
             return np.nan
         _innovate(seen, dx, rows, nu)
-        _forward(rows.Z, nu, w)
+        whiten_innovation(rows.Z, nu, w)
         for j in range(n):
             dx[j] = 0.0
         for r in range(m):
@@ -113,9 +107,8 @@ def update(
         flatten(R, t, plane, turn_cov, flat.R, flat.t)
         if not _whiten(station, flat, seen, rows):
             return np.nan
-        _forward(rows.Z, nu, w)
-    _shrink(P, rows.G, estimated)
-    _separate(rows, w, outputs(R, t), separations)
+        whiten_innovation(rows.Z, nu, w)
+    shrink(P, rows.G, estimated)
     return square
 
 
@@ -123,7 +116,7 @@ def update(
 def _whiten(station: Lights, state: FilterState, seen: Assigned, rows: _Rows) -> bool:
     """Fill all of `rows` but its lights at a state; False where a light is out of the lens's sight."""
     lights, h, cal, Z, G = rows
-    m, n, at = len(lights), len(state.P), np.empty(3)
+    m, at = len(lights), np.empty(3)
     for k in range(m):
         if not row(station, state, lights[k], at, h[k], cal[k]):
             return False
@@ -138,7 +131,15 @@ def _whiten(station: Lights, state: FilterState, seen: Assigned, rows: _Rows) ->
         Z[2 * k + 1, 2 * k + 1] += cov[1, 1]
     if math.isnan(factor(Z, 2 * m)):
         return False
-    for r in range(2 * m):
+    whiten_gains(Z, G)
+    return True
+
+
+@part
+def whiten_gains(Z: Array, G: Array) -> None:
+    """L^-1 H P in place of `G` = H P (2 m, n), with the factor L in the lower triangle of `Z` (2 m, 2 m)."""
+    n = G.shape[1]
+    for r in range(len(G)):
         for k in range(0, r - 1, 2):
             y, z = Z[r, k], Z[r, k + 1]
             for j in range(n):
@@ -150,7 +151,6 @@ def _whiten(station: Lights, state: FilterState, seen: Assigned, rows: _Rows) ->
         z = 1.0 / Z[r, r]
         for j in range(n):
             G[r, j] *= z
-    return True
 
 
 @part
@@ -175,7 +175,7 @@ def _innovate(seen: Assigned, dx: Array, rows: _Rows, nu: Array) -> None:
 
 
 @part
-def _forward(Z: Array, nu: Array, w: Array) -> None:
+def whiten_innovation(Z: Array, nu: Array, w: Array) -> None:
     """Solve Z w = nu for a lower triangle."""
     for r in range(len(nu)):
         s = nu[r]
@@ -185,7 +185,7 @@ def _forward(Z: Array, nu: Array, w: Array) -> None:
 
 
 @part
-def _shrink(P: Array, G: Array, estimated: int) -> None:
+def shrink(P: Array, G: Array, estimated: int) -> None:
     """Take the information of an update out of `P` (n, n), but not from what is only considered; `G` (2 m, n)."""
     for i in range(len(P)):
         end = i + 1 if i < estimated else estimated
@@ -195,47 +195,3 @@ def _shrink(P: Array, G: Array, estimated: int) -> None:
                 P[i, j] = P[i, j] - u * G[r, j] - v * G[r + 1, j]
         for j in range(end):
             P[j, i] = P[i, j]
-
-
-@part
-def _separate(rows: _Rows, w: Array, C: Array, separations: Array) -> None:
-    """One-fault solution separation: what leaving each light out of the update would do to the outputs `C`.
-
-    With S = L L^T the innovation's covariance (`Z`), `G` = L^-1 H P, `w` = L^-1 nu and V the columns of L^-1 that
-    belong to a light's two rows, leaving them out moves the state by -G^T V (V^T V)^-1 V^T w and adds the variance
-    G^T V (V^T V)^-1 V^T G: block elimination, exact also where states are only considered.
-    """
-    lights, Z, G, m = rows.lights, rows.Z, rows.G, len(rows.lights)
-    V, U, Y = np.empty((2 * m, 2)), np.empty((9, 2)), np.empty((2, 6))
-    for c in range(len(separations)):
-        for j in range(18):
-            separations[c, j] = 0.0
-    for k in range(m):
-        a = b = d = wu = wv = 0.0
-        for o in range(6):
-            Y[0, o] = Y[1, o] = 0.0
-        for r in range(2 * k, 2 * m):
-            su, sv = 1.0 if r == 2 * k else 0.0, 1.0 if r == 2 * k + 1 else 0.0
-            for q in range(2 * k, r):
-                su -= Z[r, q] * V[q, 0]
-                sv -= Z[r, q] * V[q, 1]
-            V[r, 0], V[r, 1] = su / Z[r, r], sv / Z[r, r]
-            for o in range(6):
-                Y[0, o] += G[r, o] * V[r, 0]
-                Y[1, o] += G[r, o] * V[r, 1]
-            a += V[r, 0] * V[r, 0]
-            b += V[r, 0] * V[r, 1]
-            d += V[r, 1] * V[r, 1]
-            wu += V[r, 0] * w[r]
-            wv += V[r, 1] * w[r]
-        det = a * d - b * b
-        for j in range(9):
-            U[j, 0] = U[j, 1] = 0.0
-            for o in range(6):
-                U[j, 0] += C[j, o] * Y[0, o]
-                U[j, 1] += C[j, o] * Y[1, o]
-        c = lights[k]
-        for j in range(9):
-            u, v = (d * U[j, 0] - b * U[j, 1]) / det, (a * U[j, 1] - b * U[j, 0]) / det
-            separations[c, j] = -(u * wu + v * wv)
-            separations[c, 9 + j] = u * U[j, 0] + v * U[j, 1]
