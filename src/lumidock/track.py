@@ -147,7 +147,15 @@ def open_bank(model: StationModel) -> Bank:
     """A bank in which no subset has begun."""
     S, m, n = int(model.group.max()) + 1, len(model), kernel.LIGHTS + 3 * len(model)
     none, nobody = np.full(S, -1, np.int64), np.zeros(m, np.int64)
-    return Bank(np.zeros((S, n)), np.empty((S, n, n)), np.zeros(S, np.int64), none, nobody, nobody, nobody)
+    return Bank(
+        np.zeros((S, n)),
+        np.empty((S, n, n)),
+        begun=np.zeros(S, np.int64),
+        plane=none,
+        used=nobody,
+        seen=nobody,
+        proven=nobody,
+    )
 
 
 def _copied(bank: Bank) -> Bank:

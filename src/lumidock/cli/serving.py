@@ -10,15 +10,17 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from lumidock import methods
 from lumidock.app.serve import STALE_S, Newest, Server, SourceReader, Worker
 from lumidock.app.warm import warm_up
-from lumidock.camera import save_camera
+from lumidock.camera import Camera, save_camera
 from lumidock.cli.shared import (
     SIM,
     AsJson,
@@ -54,7 +56,7 @@ from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
 from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, open_rerun
-from lumidock.streams.source import Reading
+from lumidock.streams.source import Reading, Source
 from lumidock.streams.vehicle import load_vehicle
 
 _LOOPBACK, _ENDPOINT = "127.0.0.1", re.compile(r"(tcp|udp|tls|quic)/[^/?#]+:[0-9]{1,5}")
@@ -138,45 +140,45 @@ def _serve(
         if source.startswith(SIM):
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             source = str(simulated(source, folder / "sequence", station, camera))
-        reading = Reading(
-            fps,
-            topic,
-            info_topic,
-            bits,
-            as_stored=as_stored,
-            trusted=trust_calibration,
-            follow_calibration=camera is None,
-        )
+        reading = Reading(fps, topic, info_topic, bits, as_stored=as_stored, trusted=trust_calibration)
+        reading = replace(reading, follow_calibration=camera is None)
         opened = open_any(source, reading, delay_ms=delay_ms, station=station)
         station_file = file_of("station", station, opened.station, opened)
-        dock = load_station(station_file)
         calibration = calibration_of(camera, opened, name=camera_name, trusted=trust_calibration)
-        lens = calibration.camera
         tell((*opened.notes, *calibration.warnings))
-        setting = Setting(dock, lens, mounting)
-        warn_if_nothing_is_kept()
-        list(warm_up(localizer_of(method, dock, lens, settings).process, dock, lens))
-        localizer = localizer_of(method, dock, lens, settings)
+        setting = Setting(load_station(station_file), calibration.camera, mounting)
         sinks = [
             *_vehicle_sinks(setting, mavlink, zenoh, domain if dds else None, domain, host),
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
         ]
-        sys.setswitchinterval(_SWITCH_S)
-        stop, newest = threading.Event(), Newest()
-        reader = SourceReader(
-            partial(opened.items, (lens.width, lens.height)), newest, live=opened.live, loop=loop, stop=stop
-        )
-        server = Server(localizer, reader, newest, sinks, stop)
+        server = _server(opened, _ready_localizer(method, setting, settings), setting.camera, sinks, loop=loop)
         page = _health_page(host, health_port, server)
         stack.callback(page.close)
         # last of all, so that a start that fails leaves what is on the disk alone
         sinks += _file_sinks(setting, station_file, out, record or [], force)
         print(f"health at http://{host}:{page.port}/", file=sys.stderr if as_json else sys.stdout, flush=True)
-        with _stopped_by_signals(stop):
+        with _stopped_by_signals(server.stop):
             server.serve()
     _print_counts(server, as_json)
-    if reader.problem and not opened.live:
-        raise InputError(reader.problem)
+    if server.camera.problem and not opened.live:
+        raise InputError(server.camera.problem)
+
+
+def _ready_localizer(name: str, setting: Setting, settings: Config) -> methods.Method:
+    """A localizer whose kernels are compiled."""
+    warn_if_nothing_is_kept()
+    dock, lens = setting.station, setting.camera
+    list(warm_up(localizer_of(name, dock, lens, settings).process, dock, lens))
+    return localizer_of(name, dock, lens, settings)
+
+
+def _server(opened: Source, localizer: methods.Method, lens: Camera, sinks: list[Worker], *, loop: bool) -> Server:
+    """A server of the newest frame of a source, which nothing has started yet."""
+    sys.setswitchinterval(_SWITCH_S)
+    stop, newest = threading.Event(), Newest()
+    read = partial(opened.items, (lens.width, lens.height))
+    reader = SourceReader(read, newest, live=opened.live, loop=loop, stop=stop)
+    return Server(localizer, reader, newest, sinks, stop)
 
 
 def _print_counts(server: Server, as_json: bool) -> None:

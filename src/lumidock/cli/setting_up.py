@@ -112,9 +112,9 @@ def _survey(
     path = shipped_or_path("station", station) if station is not None else cast("Path", out)
     if lights is not None:
         _write_layout(sources, camera, lights, distances or [], path)
-    drawing = load_station(path)
+    drawing, sigma_m = load_station(path), _CHECK_SIGMA_M if check else off
     tapes = [_distance(text, drawing, distance_sigma) for text in distances or ()]
-    prior = prior_of(drawing, sigma_m=_CHECK_SIGMA_M if check else off, known=known or (), distances=tapes)
+    prior = prior_of(drawing, sigma_m=sigma_m, known=known or (), distances=tapes)
     with progress_bar("survey") as progress:
         lens, recordings = _recordings(sources, drawing, camera, (settings, fps))
         found = survey(recordings, drawing, lens, settings, prior, progress=progress)

@@ -48,8 +48,7 @@ def associate(
     those after it through their joint covariance (J. Neira, J. Tardos, 2001). Costs are -log evidence over "all
     clutter"; associations more than `reach` behind the best are not followed.
     """
-    expected, S, shown = predicted
-    m = len(shown)
+    (expected, S, shown), m = predicted, len(predicted.shown)
     uv, var, like, log_clutter = frame.uv, frame.var, frame.like, frame.log_density
     detect, gate, reach, max_nodes = terms
     cand, n_cand = _candidates(predicted, uv, var, gate)
