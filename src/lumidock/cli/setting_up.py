@@ -126,6 +126,11 @@ def _survey(
         if lights is not None:
             path.unlink()
         raise InputError(f"survey refused: {found.refusal}")
+    _report(found, drawing, out, as_json)
+
+
+def _report(found: Survey, drawing: Station, out: Path | None, as_json: bool) -> None:
+    """Print a survey that was written to `out`, or without it which lights have moved since the drawing."""
     if out is None:
         _report_moves(found, drawing, as_json)
         return
