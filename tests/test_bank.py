@@ -8,6 +8,7 @@ from tracks import BOTH, CONFIG, FRONT, MODEL, STEP_NS, M, assigned, head_on, me
 
 from lumidock import integrity, track
 from lumidock._kernels.tracking import track as kernel
+from lumidock.alert_limits import DEFAULT_ALERT_LIMITS
 from lumidock.datatypes import Attitude
 from lumidock.evaluation import claims
 from lumidock.geometry import se3_exp, se3_inverse
@@ -99,7 +100,7 @@ def test_no_pose_is_used_beyond_its_levels_whatever_one_wrong_light_has_done(rng
                 history[k][1][lights[0]] += beside_px * np.array([np.cos(angle), np.sin(angle)])
             one = follow(history, lights)
             bound = None if one is None else integrity.bounds([one], MODEL, CONFIG.integrity)
-            if bound is None or not integrity.pose_holds(bound):
+            if bound is None or not integrity.pose_holds(bound, DEFAULT_ALERT_LIMITS):
                 continue
             error, level = claims.pose_error(bound.T_dock_cam, history[-1][0]), bound.protection
             assert np.hypot(*error[:2]) < level.lateral_m

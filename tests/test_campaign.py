@@ -237,7 +237,7 @@ def test_cold_and_warm_are_different_campaigns(lumidock, tmp_path):
     code, _, err = lumidock(*words, "--cold")
     assert (code, err.count("\n")) == (2, 1)
     assert lumidock(*words, "--cold", "--force")[0] == 0
-    assert "every frame cold" in (tmp_path / "out" / "table.md").read_text()
+    assert "every frame without history" in (tmp_path / "out" / "table.md").read_text()
 
 
 @pytest.mark.parametrize(

@@ -193,7 +193,7 @@ def test_the_source_is_not_written_into(refusal, sequence):
         (["trials", "--station", "nowhere"], "nowhere: No such file"),
         (["trials", "--camera", "nowhere"], "nowhere: No such file"),
         (["trials", "--video", "--detections"], "have no pictures"),
-        (["flat-port", "--detections"], "only rendered"),
+        (["flat-port", "--detections"], "which bare detections do not model; render it"),
         (["trials", "--video", "--set", "output.pixels=mono16", "--set", "output.file=png"], "not mono16"),
     ],
     ids=lambda words: " ".join(words) if isinstance(words, list) else None,

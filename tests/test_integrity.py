@@ -79,7 +79,7 @@ def test_sigma_factors_are_those_of_the_chi_distribution(risk):
 
 @pytest.mark.parametrize("z_m", [1.0, 6.0, 20.0])
 def test_levels_hold_as_often_as_they_say(z_m, rng):
-    risk, n = 0.02, 4000
+    risk, n = 0.01, 8000
     T_dock_cam, P6 = at(z_m, rng), covariance(rng)
     bound = bounds([hypothesis(T_dock_cam, P6)], MODEL, IntegrityConfig(risk=risk))
     draws = rng.multivariate_normal(np.zeros(6), P6, n)
@@ -159,7 +159,13 @@ def test_levels_reach_the_state_that_never_saw_a_light(lights, proven, rng):
     level = levels_of(bounds([hypothesis(T_dock_cam, P6, lights=lights, pulled=pulled)], MODEL, config))
     assert (level >= plain).all()
     fault = config.fault_proven if proven else config.fault
-    alone = levels_of(bounds([hypothesis(T_dock_cam, 2.0 * P6)], MODEL, IntegrityConfig(risk=config.risk / fault)))
+    alone = levels_of(
+        bounds(
+            [hypothesis(T_dock_cam, 2.0 * P6)],
+            MODEL,
+            IntegrityConfig.model_construct(**(config.model_dump() | {"risk": config.risk / fault})),
+        )
+    )
     assert (level > 0.98 * (np.array(sizes(T_dock_cam, T_blind)) + alone)).all()
 
 

@@ -60,4 +60,4 @@ def test_the_installed_wheel_simulates_and_runs(lumidock, tmp_path):
     settings = [word for setting in APPROACH for word in ("--set", setting)]
     lumidock("sim", "approach", *settings, "--camera", tmp_path / "camera.yaml", "--out", tmp_path / "sequence")
     text = lumidock("run", tmp_path / "sequence", "--out", tmp_path / "run")
-    assert "3 frames: 3 valid" in text
+    assert "3 frames: 2 valid" in text  # one frame alone is not proven

@@ -61,7 +61,7 @@ def test_a_folder_a_video_and_bags_give_the_same_fixes(lumidock, sequence, tmp_p
     station, camera = ("--station", sequence / "station.yaml"), ("--camera", sequence / "camera.yaml")
     assert lumidock("run", sequence, "--method", method, "--out", tmp_path / "wanted")[0] == 0
     wanted = fixes(tmp_path / "wanted")
-    assert sum(row["valid"] == "1" or row["guide"] == "1" for row in wanted) >= 3
+    assert sum(row["valid"] == "1" or row["guide"] == "1" for row in wanted) >= 2  # of 7; the first are not proven
     for number, source in enumerate(sources):
         more = camera if source.suffix == ".mkv" else ()  # a bag brings its own
         out = tmp_path / f"run{number}"
@@ -79,7 +79,7 @@ def test_raw_pictures_give_the_same_fixes_from_a_folder_and_from_bags(lumidock, 
     station = ("--station", raw / "station.yaml")
     assert lumidock("run", raw, "--out", tmp_path / "wanted")[0] == 0
     wanted = fixes(tmp_path / "wanted")
-    assert sum(row["valid"] == "1" or row["guide"] == "1" for row in wanted) >= 3
+    assert sum(row["valid"] == "1" or row["guide"] == "1" for row in wanted) >= 2  # of 7; the first are not proven
     for kind in bags.KINDS:
         bag, out = as_bag(tmp_path, kind, raw), tmp_path / f"run-{kind}"
         assert [item.encoding for item in open_source(bag).items()] == [item.encoding for item in frames(raw)]

@@ -298,7 +298,7 @@ def load_camera(path: Path | str) -> Camera:
 
     Raises: InputError, one line, for what is missing, not finite, of the wrong length or not supported.
     """
-    return camera_of_mapping(read_mapping(Path(path)), Path(path))
+    return camera_of_mapping(read_mapping(Path(path), "camera"), Path(path))
 
 
 def camera_of_mapping(content: dict[str, Any], path: Path) -> Camera:

@@ -89,7 +89,7 @@ def _reproduce(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Repeat the paper's experiments by its method and ours, as one page."""
+    """Repeat the paper's experiments, as one page."""
     from lumidock.config import Config, load_config
     from lumidock.methods import METHODS, require_method
     from lumidock.reproduce import FULL, QUICK, Dock, Plan, reproduce

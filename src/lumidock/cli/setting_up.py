@@ -99,7 +99,7 @@ def _survey(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find where the lights of a dock really are, from recordings of approaches and a drawing that is a little off."""
+    """Find the true positions of a dock's lights from recordings."""
     from lumidock.setup.survey import prior_of, survey
 
     if check == (out is not None):

@@ -230,10 +230,13 @@ def read_calibio(path: Path, content: dict[str, Any], name: str | None) -> Camer
 
 def read_bouguet(path: Path, text: str) -> Camera:
     """A Calib_Results.m of the Camera Calibration Toolbox for Matlab, whose pixel (0, 0) is ours."""
-    found = {
-        key: [float(word) for word in re.split(r"[\s;,]+", body.strip(" ;\t")) if word]
-        for key, body in _entries(path, text)
-    }
+    try:
+        found = {
+            key: [float(word) for word in re.split(r"[\s;,]+", body.strip(" ;\t")) if word]
+            for key, body in _entries(path, text)
+        }
+    except ValueError as error:
+        raise InputError(f"{path}: Matlab toolbox calibration: {error}") from None
     for key, count in {"fc": 2, "cc": 2, "kc": 5, "nx": 1, "ny": 1}.items():
         if len(found.get(key, [])) != count:
             raise InputError(f"{path}: Matlab toolbox calibration: {key} of {count} numbers is missing")

@@ -186,12 +186,12 @@ def still_solids(matter: Matter, station: Station) -> list[Solid]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolidScene:
-    """S solids with their poses `T_frame_local` (S, 4, 4) in `cam` where `in_cam` (S,), else in `dock`.
+    """S solids with their poses `T_dock_local` (S, 4, 4) in `cam` where `in_cam` (S,), else in `dock`.
 
     `kind`, `size`, `bound_m` and `surface` (S,) are as in `raycast.Solids`; `surface` is an index of `finishes`.
     """
 
-    T_frame_local: Array
+    T_dock_local: Array
     in_cam: np.ndarray
     kind: np.ndarray
     size: Array
@@ -205,7 +205,7 @@ class SolidScene:
         names = list(dict.fromkeys(part.finish for part in parts))
         T, kind, size, bound = zip(*(_record(part) for part in parts), strict=True)
         return cls(
-            T_frame_local=np.array(T),
+            T_dock_local=np.array(T),
             in_cam=np.array([part.frame == "cam" for part in parts]),
             kind=np.array(kind, np.int64),
             size=np.array(size),
@@ -217,7 +217,7 @@ class SolidScene:
     def solids(self, T_dock_cam: Array) -> Solids:
         """The solids in `cam`, for the ray caster."""
         T_cam_dock = se3_inverse(T_dock_cam)
-        T = np.where(self.in_cam[:, None, None], self.T_frame_local, T_cam_dock @ self.T_frame_local)
+        T = np.where(self.in_cam[:, None, None], self.T_dock_local, T_cam_dock @ self.T_dock_local)
         R = np.ascontiguousarray(T[:, :3, :3])
         return Solids(self.kind, R, np.ascontiguousarray(T[:, :3, 3]), self.size, self.bound_m, self.surface)
 
@@ -241,7 +241,7 @@ class SolidScene:
 
 
 def _record(part: Solid) -> tuple[Array, int, Array, float]:
-    """Pose `T_frame_local` (4, 4), kind, size (4,) and bounding radius m of one solid."""
+    """Pose `T_dock_local` (4, 4), kind, size (4,) and bounding radius m of one solid."""
     T, size, center = np.eye(4), np.zeros(4), np.array(part.center)
     if part.kind == "tube":
         way = np.array(part.end) - center

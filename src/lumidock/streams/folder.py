@@ -56,7 +56,7 @@ def _beside(path: Path) -> tuple[Path | None, Path | None]:
 def _open_sequence(path: Path, reading: Reading) -> Source:
     """A folder with timestamps.csv, and frames/ or detections.csv."""
     stamps, detections, attitude = path / "timestamps.csv", path / "detections.csv", path / "attitude.csv"
-    rows = _read_csv(stamps, ("frame", "file", "t_ns"))
+    rows = _read_csv(stamps, ("frame", "t_ns") if detections.exists() else ("frame", "file", "t_ns"))
     if not rows:
         raise InputError(f"{stamps}: no frames")
     attitudes = _read_attitudes(attitude) if attitude.exists() else _Attitudes([], np.empty((0, 5)))
