@@ -159,7 +159,8 @@ def test_levels_reach_the_state_that_never_saw_a_light(lights, proven, rng):
     level = levels_of(bounds([hypothesis(T_dock_cam, P6, lights=lights, pulled=pulled)], MODEL, config))
     assert (level >= plain).all()
     fault = config.fault_proven if proven else config.fault
-    alone = levels_of(
+    without = IntegrityConfig.model_construct(**(config.model_dump() | {"risk": config.risk / fault}))
+    alone = levels_of(bounds([hypothesis(T_dock_cam, 2.0 * P6)], MODEL, without))
         bounds(
             [hypothesis(T_dock_cam, 2.0 * P6)],
             MODEL,
