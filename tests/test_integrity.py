@@ -161,12 +161,6 @@ def test_levels_reach_the_state_that_never_saw_a_light(lights, proven, rng):
     fault = config.fault_proven if proven else config.fault
     without = IntegrityConfig.model_construct(**(config.model_dump() | {"risk": config.risk / fault}))
     alone = levels_of(bounds([hypothesis(T_dock_cam, 2.0 * P6)], MODEL, without))
-        bounds(
-            [hypothesis(T_dock_cam, 2.0 * P6)],
-            MODEL,
-            IntegrityConfig.model_construct(**(config.model_dump() | {"risk": config.risk / fault})),
-        )
-    )
     assert (level > 0.98 * (np.array(sizes(T_dock_cam, T_blind)) + alone)).all()
 
 
