@@ -28,12 +28,14 @@ _SCALES = 0.9 * np.sqrt(2.0) ** np.arange(3)  # standard deviations of the Gauss
 _TAPS = 3.0  # standard deviations on each side that a filter sums: 0.3 % of a Gaussian is beyond
 _SAMPLES = 1024  # responses whose median absolute value is the noise: known to 4 %
 _SIGMA = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
-_ROUNDING = 0.29 * 0.115  # noise that rounding to whole grey levels leaves in a response, times the scale
-_BORDER = 2.5  # sizes of a blob from the border, within which mirrored samples draw its centroid there
+_ROUNDING = 0.29 * 0.115  # response noise of rounding at scale 1: 1/sqrt(12) grey levels times the filter's gain
+_BORDER = 2.5  # distance from the border, in blob sizes, within which mirrored samples bias the centroid toward it
 _TINY = 1e-6  # px^2, that keep a covariance regular
-_COARSE = 3  # the level from which on the whole frame is searched: one pixel of it is a tile
+_COARSE = 3  # pyramid level from which on the whole frame is searched: one of its pixels is a tile
 _LEAST_TOP = 160.0  # grey levels; nothing saturates lower
-_STEP, _PLATEAU, _FLATTER = 3.0, 16, 3  # grey levels that compression blurs; half-size pixels; times the next step's
+_STEP = 3.0  # grey levels of a histogram step, over which compression spreads a saturated level
+_PLATEAU = 16  # least pixels of the half-size image that are saturated
+_FLATTER = 3  # least ratio of the pixels in the highest step to those in the next
 _LEAST_SIDE = 4  # pixels; in less nothing stands out
 
 
@@ -63,7 +65,7 @@ class Scan:
 
 
 class _Blobs(NamedTuple):
-    """Blobs: `rows` (N, columns of `blobs`), `uv` (N, 2) px, `cov` (N, 2, 2) px^2, measures (N, MEASURES)."""
+    """Blobs: `rows` (N, columns of `blobs`), U and V px among them, `cov` (N, 2, 2) px^2, `measured` (N, MEASURES)."""
 
     rows: Array
     cov: Array
@@ -155,10 +157,10 @@ def _base(area: float, most: float) -> int:
 
 
 def _saturation(half: Image) -> float:
-    """The grey level, of 255, from which on samples are saturated: below the usual one in video of 16 to 235.
+    """The grey level, of 255, from which on samples are saturated: about 235 in video of limited range.
 
-    There the brightest pixels are many and alike; at the top of lights that are not saturated, as many pixels lie in
-    every step down.
+    The highest step of the histogram that holds far more pixels than the next one is saturated. At the peak of a light
+    that is not saturated, successive steps hold about as many.
     """
     scale = 1.0 if half.dtype == np.uint8 else 255.0 / 65535.0
     top = scale * float(half.max())
@@ -311,7 +313,7 @@ def _finer(views: list[Canvas], rows: Array) -> Array:
 
 
 def _covariance(rows: Array, out: Array, pixel: Array, config: DetectConfig) -> Array:
-    """(N, 2, 2) px^2: noise and texture, the way of the maximum between scales, and a share of the size."""
+    """(N, 2, 2) px^2: noise and texture, the shift of the maximum between scales, and a share of the size."""
     xx, xy, yy = out[:, centroid.M_XX], out[:, centroid.M_XY], out[:, centroid.M_YY]
     noise = rows[:, blobs.NOISE] ** 2 + (config.texture_share * rows[:, blobs.TEXTURE]) ** 2
     cov = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2) * noise[:, None, None]

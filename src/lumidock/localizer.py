@@ -1,4 +1,7 @@
-"""The default method: one frame, from pixels or detections, to a fix. The only object of it with memory."""
+"""The default method: one frame, from pixels or detections, to a fix.
+
+`Localizer` is its only stateful class; everything else is functions of a state that is passed in and out.
+"""
 
 from __future__ import annotations
 
@@ -93,8 +96,8 @@ def step(
 def _why_refused(last: Detections | None, detections: Detections) -> str:
     """The word for a frame that cannot be used, or nothing.
 
-    A stamp that does not follow the one before gives no fix; the next is measured against it, so that a clock that was
-    set back costs one frame and the history.
+    A stamp that does not follow the one before gives no fix and is the reference of the next one. So after a clock was
+    set back one frame is refused, and the track is dropped with the next, since it lies in that frame's future.
     """
     if last is not None and detections.t_ns <= last.t_ns:
         return "bad_stamp"
@@ -125,13 +128,13 @@ def _tracked(
     found = moment.acquire()
     if not _shows_two_layers(found, context):
         return integrity.assess(replace(tracked, failures=1), detections, "tracking", context)
-    # what the track has learned while it overlooked a layer is in doubt too
+    # what the track has learned while it overlooked a layer is in doubt too; a failure, so that the next search is full
     doubted = replace(state, confirmed=False, calibration=None, failures=1)
     return _acquired(doubted, followed, detections, moment, found, still_held=followed[:1])
 
 
 def _checked(state: LocalizerState, moment: Moment) -> LocalizerState:
-    """Count the frames that too few lights hold; after some of them a fresh acquisition has to agree with the track.
+    """Count successive frames with fewer than four lights; after some of them a fresh acquisition has to agree.
 
     A mirror image or another array may have taken over in the meantime, and would go on agreeing with itself.
     """
@@ -210,7 +213,7 @@ def _why_nothing(detections: Detections, found: Acquisition) -> str:
 def _coasting(
     state: LocalizerState, detections: Detections, context: Context, reason: str
 ) -> tuple[Fix, LocalizerState]:
-    """A confirmed track in a frame in which no light fits."""
+    """The predicted pose of a confirmed track in a frame that gives no accepted update; `reason` says why."""
     tracks = tracking.coast(state.hypotheses, context, failed=reason == "residual")
     state = replace(state, hypotheses=tracks, thin_frames=state.thin_frames + 1)
     return integrity.assess(state, detections, "coasting", context)

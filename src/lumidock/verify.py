@@ -15,10 +15,11 @@ from lumidock.light_counts import CHECKED_LIGHTS, JOINT_TRACK_LIGHTS, POSE_LIGHT
 from lumidock.match import Acquisition, conflicts
 from lumidock.track import Track
 
-_REPEATED_SHARE, _REPEATED_SIGMAS = 0.7, 0.15  # of the detections, rms a coordinate: two draws of noise differ by 1.4
+_REPEATED_SHARE = 0.7  # of the detections that must repeat
+_REPEATED_SIGMAS = 0.15  # rms difference a coordinate of a repeated detection; that of independent noise is sqrt(2)
 _MOVES_M_S, _MOVES_RAD_S = 0.1, 0.02  # faster is not hovering
 _MOVED_SIGMAS = 0.3  # rms a coordinate that the lights are expected to have moved: twice what counts as a repetition
-_TOLD_SHARE = 0.02  # of a prior variance: with less taken out the test rests on linearisation
+_TOLD_SHARE = 0.02  # least share of a prior variance that measurements removed; below, linearisation errors dominate
 _CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 
 
@@ -29,7 +30,7 @@ def innovation_holds(track: Track, config: TrackConfig) -> bool:
 
 
 def explains(track: Track, lamps: int, config: TrackConfig) -> bool:
-    """Whether a track passes its innovation test and leaves no array's worth of a frame's `lamps` unexplained."""
+    """Whether a track passes its innovation test, and uses three lights or leaves under four `lamps` unassigned."""
     used = track.last.n_used
     return (used >= POSE_LIGHTS or lamps - used < CHECKED_LIGHTS) and innovation_holds(track, config)
 
@@ -37,7 +38,8 @@ def explains(track: Track, lamps: int, config: TrackConfig) -> bool:
 def holds(track: Track, lamps: int, config: TrackConfig) -> bool:
     """Whether a track explains a frame of so many `lamps`, by lights enough.
 
-    Three lights of one plane fit many poses: only a track that has seen two layers lives on less than four.
+    Three lights of one plane fit many poses. Only a track that estimates its calibration states, which it begins when
+    it first sees two layers together, needs fewer than four.
     """
     least = JOINT_TRACK_LIGHTS if track.estimates_calibration else CHECKED_LIGHTS
     return track.last.n_used >= least and explains(track, lamps, config)
@@ -125,14 +127,15 @@ def contradict(a: Indices, b: Indices) -> bool:
 
 
 def remaining_margin(track: Track, margin: float, config: IntegrityConfig) -> float:
-    """The margin that one frame gave an association, until no frame agrees with it: then it no longer proves it."""
+    """The margin of the frame that confirmed the track, capped where no frame agrees: alone it then proves nothing."""
     return margin if track.agreeing_frames > 0 else min(margin, config.evidence)
 
 
 def is_proven(track: Track, margin: float, config: IntegrityConfig) -> bool:
-    """Whether the association meets the stated risk: by the evidence of one frame, or carried by several in a row.
+    """Whether the association meets the stated risk: by the evidence of one frame, or by successive frames that agree.
 
-    One that no single frame could decide (`margin` 0) has to be carried for longer; after a failed test all have to.
+    More frames have to agree where no single frame could decide (`margin` 0). After a failed test the margin is capped
+    (`remaining_margin`), so that agreeing frames are needed again.
     """
     carried = config.carried_frames if margin > 0.0 else config.gathered_frames
     return track.agreeing_frames > 0 and (margin > config.evidence or track.agreeing_frames >= carried)

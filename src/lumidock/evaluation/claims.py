@@ -26,8 +26,8 @@ class PoseClaims:
     """N valid fixes: their errors against the truth, and the uncertainty that they state.
 
     `z_m` (N,) estimated; `errors` (N, 6) [t_est - t_true m, w rad], R_est = Exp(w) R_true, in dock axes; `levels`
-    (N, 3) protection levels lateral m, axial m, total rotation rad; `covariance` (N, 6, 6) of the errors; both NaN
-    where the method gives none; `stage` (N,); `alert_limits` of the dock.
+    (N, 3) protection levels lateral m, axial m, total rotation rad; `covariance` (N, 6, 6) of the errors; levels and
+    covariance are NaN where the method states none; `stage` (N,); `alert_limits` of the dock.
     """
 
     z_m: Array
@@ -48,7 +48,7 @@ class PoseClaims:
         return error_sizes(self.errors)
 
     def limits(self) -> Array:
-        """Alert limits (N, 3) in the order of `sizes`; without a protection level those at the estimated z."""
+        """Alert limits (N, 3) in the order of `sizes`, at the estimated z less the axial protection level, if any."""
         return self.alert_limits.of_poses(self.z_m, np.nan_to_num(self.levels[:, 1]))
 
 
@@ -102,7 +102,7 @@ def true_guide(T_dock_cam_true: Array) -> Array:
 
 
 def hazardous(claims: Claims) -> dict[str, int]:
-    """Frames that say they may be used although an error is over its alert limit: `any`, and by kind of error."""
+    """How many frames whose fix may be used have an error over its alert limit: `any`, and by kind of error."""
     over = claims.sizes() > claims.limits()
     return {"any": int(over.any(axis=1).sum())} | _counts(_names(claims), over)
 
@@ -118,7 +118,7 @@ def stanford(errors: Array, levels: Array, limits: Array) -> dict[str, int]:
     """Frames (N,) in each region of the Stanford diagram, by error, protection level and alert limit.
 
     `unavailable`: the level is over the limit, or unknown; of the others `hazardous`: the error is over the limit;
-    `misleading`: it is over the level only; `nominal`: it is within both.
+    `misleading`: it is over the level and not over the limit; `nominal`: within both.
     """
     available, beyond = levels <= limits, errors > levels
     hazard = available & (errors > limits)

@@ -63,7 +63,7 @@ class RunView:
 
     @property
     def valid(self) -> np.ndarray:
-        """Which frames (N,) have a pose."""
+        """Which frames (N,) have a valid fix."""
         return np.array([fix.valid for fix in self.fixes], bool)
 
     @property
@@ -73,7 +73,7 @@ class RunView:
 
 
 def load_run(folder: Path, source: Path | None = None) -> RunView:
-    """Read a run folder; images and truth from `source`, or from the sequence found beside or in the run.
+    """Read a run folder; images and truth from `source`, or from the recorded sequence in the run folder or beside it.
 
     Raises: InputError, one line, for a folder that is no run, or a source that it was not made from.
     """

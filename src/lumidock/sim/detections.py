@@ -225,7 +225,7 @@ def _dark(
 def _box(scenario: Scenario, camera: Camera, uv: Array, visible: np.ndarray) -> tuple[Array, Array]:
     """Corners (N, 2) px of the box in which spurious detections are drawn.
 
-    It is the whole picture, or the bounding box of the lights in view with half its size added in each direction.
+    It is the whole picture, or the bounding box of the lights in view, enlarged by a quarter of its size on every side.
     """
     low, high = np.full((len(uv), 2), -0.5), np.tile([camera.width - 0.5, camera.height - 0.5], (len(uv), 1))
     if scenario.detections.place == "picture":
@@ -266,7 +266,7 @@ def _spurious(
 def _table(
     uv: Array, lit: np.ndarray, spurious: tuple[Indices, Array], range_m: Array, dock_is_shown: bool
 ) -> DetectionTable:
-    """Table of all lit lights and spurious detections, frame by frame; mirror images are of no light of the dock."""
+    """Table of all lit lights and spurious detections, frame by frame; without the dock no detection has a light."""
     frame, light = np.nonzero(lit)
     seen, nothing = np.concatenate([uv[frame, light], spurious[1]]), np.full(len(spurious[0]), -1)
     far = np.concatenate([range_m[frame, light] if dock_is_shown else np.full(len(light), np.nan), nothing * np.nan])
@@ -282,7 +282,7 @@ def _is_rear(station: Station) -> np.ndarray:
 
 
 def _p_rear(scenario: Scenario, station: Station, light: Indices, rng: np.random.Generator) -> Array:
-    """Probability (S,) that each detection is of the rear layer; spurious ones have that of front lights."""
+    """Probability (S,) that a detection is of the rear layer; spurious ones start as front, `wrong_layer` flips any."""
     front = station.layers.index(station.layers_front_to_rear()[0])
     rear = (light >= 0) & (station.layer[light] != front)
     rear ^= rng.random(len(light)) < scenario.detections.wrong_layer

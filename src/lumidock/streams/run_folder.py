@@ -159,7 +159,7 @@ def _fix_row(fix: Fix, latency_us: int | None, t_ns: int | None) -> list[object]
 
 
 def _covariance_fields(covariance: Array | None) -> list[str]:
-    """The upper triangle row by row; of a planar array far away, whose lateral error goes with its tilt, to the end."""
+    """The upper triangle row by row, in 12 digits: lateral and tilt errors of a far plane are nearly proportional."""
     if covariance is None:
         return [""] * len(COVARIANCE_COLUMNS)
     return [_short(value, 12) for value in covariance[np.triu_indices(6)]]
@@ -201,10 +201,10 @@ def _seconds(t_ns: int) -> str:
 
 
 def identities(files: Mapping[str, Path]) -> dict[str, dict[str, Any]]:
-    """What tells the inputs of a run from others, for run.json: `inputs_sha256` of whole files.
+    """Hashes that identify the inputs of a run, for run.json: `inputs_sha256` of whole files.
 
     Of a file over 16 MiB, a recording of perhaps many GB, `inputs_sampled`: its size and the hash of 64 blocks spread
-    over it, the first and the last among them. It tells recordings apart; that every byte is the same it does not say.
+    over it, the first and the last among them. It tells recordings apart, and does not prove that two are identical.
     """
     whole, sampled = dict[str, Any](), dict[str, Any]()
     for name, path in files.items():

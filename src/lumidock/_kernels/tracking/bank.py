@@ -36,14 +36,15 @@ from lumidock._kernels.tracking.track import (
 from lumidock._kernels.tracking.update import Assigned, shrink, whiten_gains, whiten_innovation
 from lumidock.datatypes import Array, Indices
 
-_FLATTENINGS, _FLATTENED = 12, 1.02  # of a start: the flatter the view, the wider the tilt, until it grows no more
+_FLATTENINGS = 12  # most linearisations of a start, each at a more frontal view of the plane, which widens its tilt
+_FLATTENED = 1.02  # growth of the tilt variance below which they end
 _PRESENT_NIS = 9.2  # chi-square, 2 dof, 1 %: a light is where its blind state expects it
 
 
 class Bank(NamedTuple):
     """S subset states of n states each, for M lights.
 
-    `offset` (S, n): each state against the filter's. `P` (S, n, n): its covariance. `begun` (S,): 1 once a light that
+    `offset` (S, n): each state minus the filter's. `P` (S, n, n): its covariance. `begun` (S,): 1 once a light that
     it is blind to was used. `plane` (S,): the layer on whose plane its last lights all lay, or -1. `used` (M,): 1 once
     the light was; `seen` (M,): 1 where the last frame had it; `proven` (M,): 1 where geometry has proven it.
     """
@@ -61,8 +62,8 @@ class BankRules(NamedTuple):
     """How the subsets are updated.
 
     `group` (M,): the subset that is blind to each light. `layer` (M,) of each light and the `planes` (L, 6) of the
-    layers. `estimated`: how many states move; the others are considered. `depth_known`: the track has seen two layers,
-    so that four lights of one hold the tilt. `starting`: the first frame of a track; the tilt of a plane is as open as
+    layers. `estimated`: how many states are updated; the others are consider states (S. F. Schmidt, 1966).
+    `depth_known`: the track has seen two layers, so that four lights of one hold the tilt. `starting`: the first frame of a track; the tilt of a plane is as open as
     `turn_cov` (3, 3) rad^2 at least. A light that its blind state predicts to `proven_m` m, 1 sigma, is proven.
     """
 
@@ -166,8 +167,8 @@ def begin_subsets(bank: Bank, state: FilterState, assignment: Indices, group: In
 def update_bank(station: Lights, state: FilterState, seen: Assigned, rules: BankRules, bank: Bank) -> None:
     """Update every subset by the assigned detections that it may see, in place; `state` is the updated filter's.
 
-    Seen at a slant by mistake, a plane would seem to tell its tilt: a subset that sees only one is linearised at the
-    flattest view within three sigmas of its own tilt, as in `update`.
+    Linearised at a wrong tilt, a single plane would seem to measure its tilt. So a subset that sees only one plane is
+    linearised at the most frontal view within three sigmas of its own tilt, as in `update`.
     """
     n, pixels = len(state.x), _rows(station, state, seen.assignment)
     r = 2 * len(pixels.lights)
