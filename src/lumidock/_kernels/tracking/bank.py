@@ -63,8 +63,9 @@ class BankRules(NamedTuple):
 
     `group` (M,): the subset that is blind to each light. `layer` (M,) of each light and the `planes` (L, 6) of the
     layers. `estimated`: how many states are updated; the others are consider states (S. F. Schmidt, 1966).
-    `depth_known`: the track has seen two layers, so that four lights of one hold the tilt. `starting`: the first frame of a track; the tilt of a plane is as open as
-    `turn_cov` (3, 3) rad^2 at least. A light that its blind state predicts to `proven_m` m, 1 sigma, is proven.
+    `depth_known`: the track has seen two layers, so that four lights of one hold the tilt. `starting`: the first frame
+    of a track; the tilt of a plane is as open as `turn_cov` (3, 3) rad^2 at least. A light that its blind state
+    predicts to `proven_m` m, 1 sigma, is proven.
     """
 
     group: Indices
