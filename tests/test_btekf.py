@@ -34,7 +34,7 @@ def moving(rng, z, frames=12):
 
 def test_prediction_follows_constant_twist_and_grows(rng):
     twist = rng.normal(0, 0.3, 6)
-    track = btekf.Track(0, pose(0, 0, 9), twist, 0.01 * np.eye(12))
+    track = btekf.LayerTrack(0, pose(0, 0, 9), twist, 0.01 * np.eye(12))
     ahead = btekf.predict(track, DT_NS, CONFIG)
     np.testing.assert_allclose(ahead.T_dock_cam, track.T_dock_cam @ se3_exp(0.15 * twist))
     assert np.linalg.eigvalsh(ahead.cov).min() > 0
@@ -43,7 +43,7 @@ def test_prediction_follows_constant_twist_and_grows(rng):
 
 def test_prediction_covariance_agrees_with_sampling(rng):
     twist, cov = np.array([0.2, -0.1, 1.0, 0.1, -0.2, 0.3]), np.diag(np.repeat([0.02, 0.01, 0.1, 0.05], 3)) ** 2
-    track = btekf.Track(0, pose(0, 0, 9), twist, cov)
+    track = btekf.LayerTrack(0, pose(0, 0, 9), twist, cov)
     quiet = BtekfConfig(accel_m_s2=1e-9, accel_rad_s2=1e-9)
     ahead = btekf.predict(track, 10**9, quiet)
     samples = rng.multivariate_normal(np.zeros(12), cov, 4000)
@@ -107,7 +107,7 @@ def test_without_the_missing_branch_one_dark_light_with_clutter_in_its_gate_void
 
 def test_without_its_own_noise_in_the_gate_a_certain_track_refuses_every_light():
     T = pose(0.0, 0.0, 9.0)
-    certain = btekf.Track(0, T, np.zeros(6), 1e-12 * np.eye(12))
+    certain = btekf.LayerTrack(0, T, np.zeros(6), 1e-12 * np.eye(12))
     uv = project_lights(CAMERA, T, P_DOCK) + np.array([0.7, -0.5])
     assert btekf.correct(certain, CAMERA, P_DOCK, uv, CONFIG)[1].tolist() == list(range(7))
     assert btekf.correct(certain, CAMERA, P_DOCK, uv, BtekfConfig(noise_in_gate=False)) is None

@@ -19,7 +19,7 @@ from lumidock.pose import project_lights, project_lights_with_jacobian
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Track:
+class LayerTrack:
     """Pose `T_dock_cam` (4, 4), `twist` (6,) [m/s, rad/s] in cam, and their covariance (12, 12) at `t_ns`."""
 
     t_ns: int
@@ -28,7 +28,7 @@ class Track:
     cov: Array
 
 
-def start(t_ns: int, T_dock_cam: Array, camera: Camera, p_dock: Array, config: BtekfConfig) -> Track:
+def start(t_ns: int, T_dock_cam: Array, camera: Camera, p_dock: Array, config: BtekfConfig) -> LayerTrack:
     """Begin a track at a pose found from the lights `p_dock` (N, 3), with an unknown velocity."""
     _, J = project_lights_with_jacobian(camera, T_dock_cam, p_dock)
     information = np.einsum("nij,nik->jk", J, J) / config.pixel_sigma**2 + 1e-3 * np.eye(6)
@@ -36,10 +36,10 @@ def start(t_ns: int, T_dock_cam: Array, camera: Camera, p_dock: Array, config: B
     cov[:6, :6] = np.linalg.inv(information)
     cov[6:9, 6:9] = np.eye(3) * config.start_speed_m_s**2
     cov[9:, 9:] = np.eye(3) * config.start_rate_rad_s**2
-    return Track(t_ns, T_dock_cam, np.zeros(6), cov)
+    return LayerTrack(t_ns, T_dock_cam, np.zeros(6), cov)
 
 
-def predict(track: Track, t_ns: int, config: BtekfConfig) -> Track:
+def predict(track: LayerTrack, t_ns: int, config: BtekfConfig) -> LayerTrack:
     """Carry a track to `t_ns` at constant twist, with white noise on the acceleration."""
     dt = (t_ns - track.t_ns) * 1e-9
     F = np.eye(12)
@@ -50,10 +50,10 @@ def predict(track: Track, t_ns: int, config: BtekfConfig) -> Track:
     Q[:6, :6] = np.diag(noise * dt**3 / 3.0)
     Q[6:, 6:] = np.diag(noise * dt)
     Q[:6, 6:] = Q[6:, :6] = np.diag(noise * dt**2 / 2.0)
-    return Track(t_ns, track.T_dock_cam @ se3_exp(track.twist * dt), track.twist, F @ track.cov @ F.T + Q)
+    return LayerTrack(t_ns, track.T_dock_cam @ se3_exp(track.twist * dt), track.twist, F @ track.cov @ F.T + Q)
 
 
-def update(track: Track, camera: Camera, p_dock: Array, uv: Array, config: BtekfConfig) -> Track:
+def update(track: LayerTrack, camera: Camera, p_dock: Array, uv: Array, config: BtekfConfig) -> LayerTrack:
     """Sequential update with known matches: lights `p_dock` (N, 3) seen at `uv` (N, 2)."""
     for p, pixel in zip(p_dock, uv, strict=True):
         gate = _Gate.of(track, camera, p, config)
@@ -72,7 +72,7 @@ class _Gate:
     S_gate: Array
 
     @classmethod
-    def of(cls, track: Track, camera: Camera, p: Array, config: BtekfConfig) -> _Gate | None:
+    def of(cls, track: LayerTrack, camera: Camera, p: Array, config: BtekfConfig) -> _Gate | None:
         """Predict one light (3,); None when the lens does not see it from there."""
         uv, J_uv_pose = project_lights_with_jacobian(camera, track.T_dock_cam, p[None])
         if not np.isfinite(uv).all():
@@ -87,18 +87,18 @@ class _Gate:
         error = uv - self.v
         return np.asarray(np.einsum("ni,ni->n", error, np.linalg.solve(self.S_gate, error.T).T))
 
-    def update(self, track: Track, pixel: Array) -> Track:
+    def update(self, track: LayerTrack, pixel: Array) -> LayerTrack:
         """The track after this light was seen at `pixel` (2,): eq. (13)."""
         K = np.linalg.solve(self.S, self.J @ track.cov).T
         step = K @ (pixel - self.v)
         cov = track.cov - K @ self.S @ K.T
         T_dock_cam = track.T_dock_cam @ se3_exp(step[:6])
-        return Track(track.t_ns, T_dock_cam, track.twist + step[6:], 0.5 * (cov + cov.T))
+        return LayerTrack(track.t_ns, T_dock_cam, track.twist + step[6:], 0.5 * (cov + cov.T))
 
 
 def correct(
-    predicted: Track, camera: Camera, p_dock: Array, uv: Array, config: BtekfConfig
-) -> tuple[Track, Indices] | None:
+    predicted: LayerTrack, camera: Camera, p_dock: Array, uv: Array, config: BtekfConfig
+) -> tuple[LayerTrack, Indices] | None:
     """Associate the detections `uv` (N, 2) with the lights `p_dock` (M, 3) from a predicted track.
 
     Returns the updated track and the light of each detection (N,), -1 for none; None when fewer than `min_lights` are
@@ -114,7 +114,7 @@ def correct(
     return None
 
 
-def _gated_lights(predicted: Track, camera: Camera, p_dock: Array, uv: Array, config: BtekfConfig) -> list[int]:
+def _gated_lights(predicted: LayerTrack, camera: Camera, p_dock: Array, uv: Array, config: BtekfConfig) -> list[int]:
     """Lights with at least one detection inside their gate, in order of their smallest gating residual."""
     best: dict[int, float] = {}
     for i, p in enumerate(p_dock):
@@ -132,7 +132,7 @@ class _Search:
         self.camera, self.p_dock, self.uv, self.config = camera, p_dock, uv, config
         self.nodes = 0
 
-    def run(self, track: Track, lights: list[int], used: frozenset[int], missing: int) -> Track | None:
+    def run(self, track: LayerTrack, lights: list[int], used: frozenset[int], missing: int) -> LayerTrack | None:
         """The track after all `lights` are associated with at most `missing` left out; None: backtrack."""
         if not lights:
             return track
@@ -146,7 +146,7 @@ class _Search:
                 return done
         return self.run(track, rest, used, missing - 1) if missing else None
 
-    def _candidates(self, track: Track, light: int, used: frozenset[int]) -> list[tuple[int, Track]]:
+    def _candidates(self, track: LayerTrack, light: int, used: frozenset[int]) -> list[tuple[int, LayerTrack]]:
         """Detections inside the gate of the light, nearest first, whose update leaves an acceptable residual."""
         gate = _Gate.of(track, self.camera, self.p_dock[light], self.config)
         if gate is None:
@@ -166,8 +166,8 @@ class _Search:
 
 
 def _accept(
-    track: Track, camera: Camera, p_dock: Array, uv: Array, config: BtekfConfig
-) -> tuple[Track, Indices] | None:
+    track: LayerTrack, camera: Camera, p_dock: Array, uv: Array, config: BtekfConfig
+) -> tuple[LayerTrack, Indices] | None:
     """Section 3.2.3 e: reproject every light, take the nearest detection within the pixel threshold."""
     light = associate(project_lights(camera, track.T_dock_cam, p_dock), uv, config.accept_px)
     return (track, light) if (light >= 0).sum() >= config.min_lights else None

@@ -40,7 +40,7 @@ class _Association:
 
     light: Indices
     source: MatchSource
-    track: btekf.Track | None
+    track: btekf.LayerTrack | None
 
 
 class LayerLocalizer:
@@ -51,7 +51,7 @@ class LayerLocalizer:
         self.lights = station.lights_of(layer)
         self.p_dock = station.p_dock[self.lights]
         self.registration: pso.Registration | None = None
-        self.track: btekf.Track | None = None
+        self.track: btekf.LayerTrack | None = None
         self._by_filter = False  # whether the filter associated the previous frame
         self._earned_t_ns: int | None = None  # last pose of four or more lights
         self._rng = np.random.default_rng(config.pso.seed)
@@ -74,14 +74,14 @@ class LayerLocalizer:
             return self._conclude(t_ns, uv, _Association(corrected[1], "btekf", corrected[0]))
         return self._nothing(uv, "inconsistent" if len(uv) >= MIN_FOR_SWARM else "too_few")
 
-    def _predict(self, t_ns: int) -> btekf.Track | None:
+    def _predict(self, t_ns: int) -> btekf.LayerTrack | None:
         """The track at `t_ns`, unless it is too old or from the future."""
         if self.track is None or not 0 < t_ns - self.track.t_ns <= self.config.btekf.max_gap_s * 1e9:
             self.track = self.registration = None
             return None
         return btekf.predict(self.track, t_ns, self.config.btekf)
 
-    def _by_reprojection(self, uv: Array, predicted: btekf.Track) -> _Association:
+    def _by_reprojection(self, uv: Array, predicted: btekf.LayerTrack) -> _Association:
         """Section 3.2.3 e, the frame after the filter: the nearest detection to each light as predicted."""
         projected = project_lights(self.camera, predicted.T_dock_cam, self.p_dock)
         light = btekf.associate(projected, uv, self.config.btekf.accept_px)
