@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import signal
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from typing import Literal
 
@@ -15,7 +15,7 @@ from lumidock import detect, layers
 from lumidock._kernels import compiling
 from lumidock.camera import Camera
 from lumidock.config import Config
-from lumidock.datatypes import Array, Detections, Fix, Frame
+from lumidock.datatypes import Array, Attitude, Detections, Fix, Frame
 from lumidock.geometry import se3_inverse, transform_points
 from lumidock.localizer import Localizer
 from lumidock.station import Station
@@ -25,7 +25,12 @@ _BLANK = 5  # the frame without lights, after which the track has to be taken up
 _FORMATS = {"8 bits": ("bgr8", 255), "16 bits": ("bayer_rggb16", 65535)}
 _OBJECTS = 50_000  # made between two searches for garbage, of which compiling leaves little
 _AWAY = 3.0  # and _STEP in widths of the array, all of whose lights are in the picture then
-_OTHERS = ("swarm", "pose")  # kernel modules whose entries only the paper's method and the calibration call
+_SENSOR_RAD = 0.05  # error of the attitude sensor in the last frame, whose kernels are compiled with it
+_OTHERS = (
+    "swarm",
+    "pose",
+    "assignment",
+)  # kernel modules whose entries only the paper's method and the calibration call
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +86,10 @@ def _detection(station: Station, camera: Camera) -> None:
 
 
 def _matching(station: Station, camera: Camera) -> None:
-    localizer = Localizer(station, camera)
+    localizer, head_on = Localizer(station, camera), Attitude(np.diag([1.0, -1.0, -1.0]), _SENSOR_RAD)
     for k in range(_FRAMES):
-        localizer.process_detections(Detections.from_uv(str(k), k * _STEP_NS, _view(station, camera, k)))
+        found = Detections.from_uv(str(k), k * _STEP_NS, _view(station, camera, k))
+        localizer.process_detections(replace(found, attitude=head_on) if k == _FRAMES - 1 else found)
 
 
 def warm_up(process: Callable[[Frame], Fix], station: Station, camera: Camera) -> Iterator[tuple[str, Fix]]:
