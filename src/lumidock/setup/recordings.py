@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from lumidock.errors import FrameError, InputError
 from lumidock.localizer import Localizer
 from lumidock.setup.observations import Progress
 from lumidock.station import Station
+from lumidock.streams.folder import read_csv
 
 _NUMBERS = ("u_px", "v_px", "radius_px", "flux", "p_light", "p_rear")
 
@@ -29,9 +29,9 @@ def detections_of_run(folder: Path) -> list[Detections]:
 
     Raises: InputError for tables that are none.
     """
-    stamps = {row["frame"]: row["t_ns"] for row in _rows(folder / "fixes.csv", ("frame", "t_ns"))}
+    stamps = {row["frame"]: row["t_ns"] for row in read_csv(folder / "fixes.csv", ("frame", "t_ns"))}
     frames: dict[str, list[list[float]]] = {}
-    for row in _rows(folder / "lights.csv", ("frame", *_NUMBERS)):
+    for row in read_csv(folder / "lights.csv", ("frame", *_NUMBERS)):
         try:
             frames.setdefault(row["frame"], []).append([float(row[name] or "nan") for name in _NUMBERS])
         except ValueError as error:
@@ -78,15 +78,3 @@ def detections_of_items(
         if progress is not None:
             progress(done, None)
     return out
-
-
-def _rows(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
-    try:
-        with path.open(newline="", encoding="utf-8", errors="replace") as file:
-            reader = csv.DictReader(file, restval="")
-            missing = [name for name in columns if name not in (reader.fieldnames or ())]
-            if missing:
-                raise InputError(f"{path}: no column {missing[0]}; wanted {','.join(columns)}")
-            return list(reader)
-    except (OSError, csv.Error) as error:
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None

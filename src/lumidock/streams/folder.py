@@ -56,7 +56,7 @@ def _beside(path: Path) -> tuple[Path | None, Path | None]:
 def _open_sequence(path: Path, reading: Reading) -> Source:
     """A folder with timestamps.csv, and frames/ or detections.csv."""
     stamps, detections, attitude = path / "timestamps.csv", path / "detections.csv", path / "attitude.csv"
-    rows = _read_csv(stamps, ("frame", "t_ns") if detections.exists() else ("frame", "file", "t_ns"))
+    rows = read_csv(stamps, ("frame", "t_ns") if detections.exists() else ("frame", "file", "t_ns"))
     if not rows:
         raise InputError(f"{stamps}: no frames")
     attitudes = _read_attitudes(attitude) if attitude.exists() else _Attitudes([], np.empty((0, 5)))
@@ -84,7 +84,7 @@ def _open_euroc(path: Path, reading: Reading) -> Source:
     columns = _EUROC_COLUMNS if _has_columns(table, _EUROC_COLUMNS) else ("#timestamp", "filename")
     rows = [
         {"frame": row[columns[0]].strip(), "file": row["filename"].strip(), "t_ns": row[columns[0]].strip()}
-        for row in _read_csv(table, columns)
+        for row in read_csv(table, columns)
     ]
     if not rows:
         raise InputError(f"{table}: no frames")
@@ -201,7 +201,7 @@ def _rotation_note(first: Path, reading: Reading) -> tuple[str, ...]:
     return (f"pictures are turned {how} as their EXIF data say, which the calibration has to fit; or give --as-stored",)
 
 
-def _read_csv(path: Path, columns: tuple[str, ...]) -> list[Row]:
+def read_csv(path: Path, columns: tuple[str, ...]) -> list[Row]:
     """Rows of a CSV file that has at least `columns`; a field that is missing in a row is empty."""
     try:
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
@@ -245,7 +245,7 @@ class _Attitudes:
 
 def _read_attitudes(path: Path) -> _Attitudes:
     """Attitudes by rising stamp; a row without a stamp is left out. Raises: InputError when no row is usable."""
-    rows = [(t_ns, row) for row in _read_csv(path, _ATTITUDE_COLUMNS) if (t_ns := _stamp(row["t_ns"])) is not None]
+    rows = [(t_ns, row) for row in read_csv(path, _ATTITUDE_COLUMNS) if (t_ns := _stamp(row["t_ns"])) is not None]
     rows.sort(key=lambda pair: pair[0])
     numbers = np.array([_attitude_numbers(row) for _, row in rows]).reshape(-1, 5)
     if not np.isfinite(numbers).any():
@@ -306,7 +306,7 @@ def _inside(folder: Path, name: str) -> Path:
 def _read_detections(path: Path) -> dict[str, list[Row]]:
     """Rows of a table of detections by frame."""
     detections: dict[str, list[Row]] = {}
-    for row in _read_csv(path, ("frame", "u_px", "v_px")):
+    for row in read_csv(path, ("frame", "u_px", "v_px")):
         detections.setdefault(row["frame"], []).append(row)
     return detections
 
