@@ -23,6 +23,7 @@ ENCODINGS = tuple(f"{kind}{bits}" for kind in ("mono", "bgr", *MOSAICS) for bits
 SATURATED = 250.0  # of 255, in a picture that uses them all: from this grey level on samples tell no more light
 MatchSource = Literal["pso", "btekf"]
 SensorKind = Literal["gyro", "velocity", "depth", "tilt", "attitude"]
+SensorState = Literal["used", "proving", "silent", "declined"]
 SENSOR_VALUES: dict[SensorKind, int] = {"gyro": 3, "velocity": 3, "depth": 1, "tilt": 3, "attitude": 4}
 """How many numbers a measurement of each kind has."""
 
@@ -274,7 +275,7 @@ class SensorUse:
     """
 
     kind: SensorKind
-    state: Literal["used", "proving", "silent", "declined"]
+    state: SensorState
     reason: str = ""
 
     def __str__(self) -> str:
