@@ -29,20 +29,22 @@ from lumidock.geometry import rotation_from_quat_xyzw
 from lumidock.model import StationModel
 from lumidock.track import Track
 
-# Error states behind those of the lights: bias of the gyro rad/s; relative scale, and mount rad, of the DVL; reading of
-# the depth sensor at the height of the dock's origin m; x and z of the direction that is upward in `dock`, whose y is 1.
-GYRO, SCALE, MOUNT, DEPTH, UP, ERRORS = 0, 3, 4, 7, 8, 10
+# Error states behind those of the lights: bias rad/s and delay s of the gyro; relative scale, mount rad and delay s of
+# the DVL; reading of the depth sensor at the height of the dock's origin m; x and z of the direction that is upward in
+# `dock`, whose y is 1.
+GYRO, GYRO_DELAY, SCALE, MOUNT, VELOCITY_DELAY, DEPTH, UP, ERRORS = 0, 3, 4, 5, 8, 9, 10, 12
 PROVABLE: tuple[SensorKind, ...] = ("gyro", "velocity", "depth", "tilt")  # each with a state of the bank blind to it
 MAX_BUFFER = 2000  # values that may wait for a frame: 4 s of all sensors at 100 Hz
 _LATE_S = 0.5  # a value that comes so long after the frame that it belongs before says nothing of now
 _AHEAD_S = 5.0  # one that is stamped so long after the next frame is of another clock
 _SILENT_S = 0.5  # without a value; a DVL has two in this time
-_CORRELATED_S = 1.0  # errors of mount and delay change as fast as the motion of a vehicle does
-_PROVEN_SHARE = 0.2  # of a declared variance that is left when the lights alone know the error to half its sigma
+_CORRELATED_S = 1.0  # what a wrong mount makes of a rate changes as fast as the motion of a vehicle does
+_PROVEN_SHARE = 0.3  # of a declared variance, at most, that is left when the lights have measured an error
+_PROVEN_TEST = 9.0  # chi-square, 1 dof, 0.3 %, that the error then has to pass
 _PROVEN_S = 3.0  # of agreement, in which noise and delay show too
+_MATTERS = 0.01  # share of the largest variance, below which one does nothing
 _CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 _TOLD_SHARE = 0.02  # least share of a declared variance that measurements removed; below it nothing is told
-_LEAST_M_S = 0.05  # of a speed that tells scale and mount
 _JUMPS, _FORGIVEN = 5.0, 0.25  # groups in a row that are refused before a sensor is declined; what a good one takes back
 _NEVER = -(2**62)  # ns
 
@@ -119,11 +121,17 @@ class Group(NamedTuple):
 
 
 class _Model(NamedTuple):
-    """A group against a track's prediction: rows of the filter, `errors` (K, ERRORS) of them, degrees of freedom."""
+    """A group against a track's prediction: its rows in the filter and their degrees of freedom.
+
+    `errors` (K, ERRORS): what the error states do to its numbers. `parts`: those of one source, which the lights have to
+    have measured before the sensor is proven; `delay`: that of the delay, or -1.
+    """
 
     rows: SensorRows
     errors: Array
     dof: int
+    parts: tuple[slice, ...]
+    delay: int = -1
 
 
 class Advanced(NamedTuple):
@@ -169,7 +177,7 @@ def predict(one: Track, t_ns: int, aiding: AidingState, config: Config) -> Track
 def max_gap_s(aiding: AidingState, t_ns: int, config: Config) -> float:
     """How long a track lasts without a light, s."""
     gap_s = config.track.max_gap_s
-    return max(gap_s, config.aiding.max_age_s) if aiding.carries(t_ns) else gap_s
+    return gap_s + config.aiding.max_age_s if aiding.carries(t_ns) else gap_s
 
 
 def dock_noise(dock: DockMotionConfig) -> tuple[float, float]:
@@ -272,9 +280,10 @@ def _subset(kind: SensorKind, bank: Bank) -> int:
 def declared(config: AidingConfig) -> Array:
     """Variances (ERRORS,) of the error states as the settings have them."""
     var = np.empty(ERRORS)
-    var[GYRO:SCALE] = math.radians(config.gyro.bias_deg_s) ** 2
+    var[GYRO:GYRO_DELAY] = math.radians(config.gyro.bias_deg_s) ** 2
+    var[GYRO_DELAY], var[VELOCITY_DELAY] = config.gyro.delay_sigma_s**2, config.velocity.delay_sigma_s**2
     var[SCALE] = config.velocity.scale**2
-    var[MOUNT:DEPTH] = math.radians(config.velocity.mount_sigma_deg) ** 2
+    var[MOUNT:VELOCITY_DELAY] = math.radians(config.velocity.mount_sigma_deg) ** 2
     var[DEPTH] = config.depth.dock_depth_sigma_m**2
     var[UP:] = math.radians(config.dock_level_deg) ** 2
     return var
@@ -284,9 +293,9 @@ def _walk(kind: SensorKind, config: AidingConfig) -> Array:
     """Variances (ERRORS,) that a second adds to the error states of one sensor."""
     var = np.zeros(ERRORS)
     if kind == "gyro":
-        var[GYRO:SCALE] = math.radians(config.gyro.walk_deg_s) ** 2
+        var[GYRO:GYRO_DELAY] = math.radians(config.gyro.walk_deg_s) ** 2
     elif kind == "velocity":
-        var[SCALE:DEPTH] = config.velocity.walk**2
+        var[SCALE:VELOCITY_DELAY] = config.velocity.walk**2
     elif kind == "depth":
         var[DEPTH] = config.depth.walk_m**2
     return var
@@ -338,26 +347,66 @@ def _proven(one: Track, against: _Model, before: SensorTest, test: SensorTest, c
     """
     if one.last.n_used == 0 or one.agreeing_frames == 0:  # without lights nothing contradicts a sensor
         return test
-    E, errors = against.errors, slice(len(one.state.x) - ERRORS, None)
-    prior = np.einsum("ki,i,ki->k", E, declared(config.aiding), E)
-    left = np.einsum("ki,ij,kj->k", E, one.state.P[errors, errors], E)
-    told, value = prior - left, E @ one.state.x[errors]
-    tells = told > _TOLD_SHARE * prior
-    if (value[tells] ** 2 > _CONTRADICTION * told[tells]).any():
+    known = [_told(one, against.errors, part, config.aiding) for part in against.parts]
+    tested = known if against.delay < 0 else [*known, _told(one, against.errors, _only(against.delay), config.aiding)]
+    if any(told.contradicts() for told in tested):
         return replace(test, declined="bias")
     since_s = (test.last_ns - before.last_ns) * 1e-9 if before.last_ns > _NEVER else 0.0
     agreed_s = test.agreed_s + min(max(since_s, 0.0), _SILENT_S)
-    known = bool((prior > 0.0).any() and (left <= _PROVEN_SHARE * prior).all())
-    return replace(test, agreed_s=agreed_s, proven=test.proven or (known and agreed_s >= _PROVEN_S))
+    proven = agreed_s >= _PROVEN_S and all(told.proves() for told in known)
+    return replace(test, agreed_s=agreed_s, proven=test.proven or proven)
+
+
+def _only(state: int) -> slice:
+    return slice(state, state + 1)
+
+
+class _Told(NamedTuple):
+    """What the lights have told of one source of error in K numbers: declared variance, that left, and estimate (K,)."""
+
+    prior: Array
+    left: Array
+    value: Array
+
+    def contradicts(self) -> bool:
+        """Whether an estimate is further off than what was declared allows."""
+        told = self.prior - self.left
+        tells = told > _TOLD_SHARE * self.prior
+        return bool((self.value[tells] ** 2 > _CONTRADICTION * told[tells]).any())
+
+    def proves(self) -> bool:
+        """Whether all errors are measured, and small, as far as they do anything."""
+        counts, told = self.prior > _MATTERS * self.prior.max(), self.prior - self.left
+        measured = self.left[counts] <= _PROVEN_SHARE * self.prior[counts]
+        return bool((measured & (self.value[counts] ** 2 < _PROVEN_TEST * told[counts])).all())
+
+
+def _told(one: Track, errors: Array, part: slice, config: AidingConfig) -> _Told:
+    n, E = len(one.state.x) - ERRORS, errors[:, part]
+    own = slice(n + part.start, n + part.stop)
+    prior = np.einsum("ki,i,ki->k", E, declared(config)[part], E)
+    return _Told(prior, np.einsum("ki,ij,kj->k", E, one.state.P[own, own], E), E @ one.state.x[own])
+
+
+class _Timing(NamedTuple):
+    """Rate of change of a sensor's value, its noise variance, lateness of a group s, time from group to group s."""
+
+    change: Array
+    var: float
+    late_s: float
+    dt_s: float
+
+    def repeats(self, correlated_s: float) -> float:
+        """By how much white noise has to be larger than a noise of this correlation time, to do as much in the end."""
+        return max(2.0 * correlated_s / self.dt_s, 1.0)
 
 
 def _model_of(one: Track, group: Group, test: SensorTest, config: AidingConfig) -> _Model:
-    """A group against a predicted track. Beside its noise it is off by what the settings say of delay and dock."""
+    """A group against a predicted track. Beside its noise it is off by what the settings say of the dock's motion."""
     dt = max((group.t_ns - test.last_ns) * 1e-9, 1e-3) if test.value else math.inf
-    change = np.subtract(group.value, test.value) if test.value else np.zeros(len(group.value))
-    square = max(float(change @ change) - 2.0 * len(change) * group.sigma**2, 0.0) / dt**2
+    change = np.subtract(group.value, test.value) / dt if test.value else np.zeros(len(group.value))
     late_s = max((one.t_ns - group.t_ns) * 1e-9, 0.0)
-    timing = _Timing(square, late_s, min(dt, 1.0))
+    timing = _Timing(change, 2.0 * group.sigma**2 / dt**2, late_s, min(dt, 1.0))
     if group.kind == "gyro":
         return _gyro(one, group, timing, config)
     if group.kind == "velocity":
@@ -365,59 +414,44 @@ def _model_of(one: Track, group: Group, test: SensorTest, config: AidingConfig) 
     return _depth(one, group, timing, config) if group.kind == "depth" else _tilt(one, group, timing, config)
 
 
-class _Timing(NamedTuple):
-    """Square of a sensor's rate of change, by how much a group comes too late s, and time from group to group s."""
-
-    change2: float
-    late_s: float
-    dt_s: float
-
-    def delay_var(self, sigma_s: float) -> float:
-        """Variance that an unknown delay of `sigma_s` makes, as white noise from group to group."""
-        return self.change2 * (sigma_s**2 + self.late_s**2) * self.repeats(_CORRELATED_S)
-
-    def repeats(self, correlated_s: float) -> float:
-        """By how much white noise has to be larger than a noise of this correlation time, to do as much in the end."""
-        return max(2.0 * correlated_s / self.dt_s, 1.0)
-
-
-def _wide(rows: Array, at: int, jacobian: Array) -> None:
-    rows[:, at : at + jacobian.shape[1]] = jacobian
-
-
 def _gyro(one: Track, group: Group, timing: _Timing, config: AidingConfig) -> _Model:
-    """Rates: z = w + bias, and what the dock turns."""
+    """Rates of a while ago: z = w + bias - (delay + lateness) dw/dt, and what the dock turns."""
     how, dock, state = config.gyro, config.dock_motion, one.state
-    n = len(state.x) - ERRORS
-    z = rotation_from_quat_xyzw(np.array(how.quat_xyzw)) @ group.value
+    n, R_cam_sensor = len(state.x) - ERRORS, rotation_from_quat_xyzw(np.array(how.quat_xyzw))
+    z, change = R_cam_sensor @ group.value, R_cam_sensor @ timing.change
     errors = np.zeros((3, ERRORS))
-    errors[:, GYRO:SCALE] = np.eye(3)
+    errors[:, GYRO:GYRO_DELAY], errors[:, GYRO_DELAY] = np.eye(3), -change
     turned = math.radians(how.mount_sigma_deg) ** 2 * float(z @ z) * timing.repeats(_CORRELATED_S)
     rocking = math.radians(dock.rate_deg_s) ** 2 * timing.repeats(_swing_s(dock.angle_deg, dock.rate_deg_s))
-    var = group.sigma**2 + timing.delay_var(how.delay_sigma_s) + turned + rocking
+    var = group.sigma**2 + timing.var * (how.delay_sigma_s + timing.late_s) ** 2 + turned + rocking
     columns = np.concatenate([np.arange(TWIST + 3, TWIST + 6), n + np.arange(GYRO, SCALE)])
-    residual = z - state.x[TWIST + 3 : TWIST + 6] - state.x[n + GYRO : n + SCALE]
-    return _Model(SensorRows(columns, np.hstack([np.eye(3), np.eye(3)]), residual, np.full(3, var)), errors, 3)
+    expected = state.x[TWIST + 3 : TWIST + 6] + errors @ state.x[n:] - change * timing.late_s
+    rows = SensorRows(columns, np.hstack([np.eye(3), errors[:, GYRO:SCALE]]), z - expected, np.full(3, var))
+    return _Model(rows, errors, 3, (slice(GYRO, GYRO_DELAY),), GYRO_DELAY)
 
 
 def _velocity(one: Track, group: Group, timing: _Timing, config: AidingConfig) -> _Model:
-    """Velocity over ground of a sensor at r: z = (1 + scale) u + mount x u with u = v + w x r, and what the dock moves."""
+    """Velocity over ground at r, of a while ago: z = u + scale u + mount x u - (delay + lateness) du/dt; u = v + w x r.
+
+    And what the dock moves.
+    """
     how, dock, state = config.velocity, config.dock_motion, one.state
     n, r = len(state.x) - ERRORS, np.array(how.position_m)
-    z = rotation_from_quat_xyzw(np.array(how.quat_xyzw)) @ group.value
-    v, w = state.x[TWIST : TWIST + 3], state.x[TWIST + 3 : TWIST + 6]
-    scale, mount = state.x[n + SCALE], state.x[n + MOUNT : n + DEPTH]
-    u = v + np.cross(w, r)
-    M = (1.0 + scale) * np.eye(3) + _cross(mount)
+    R_cam_sensor = rotation_from_quat_xyzw(np.array(how.quat_xyzw))
+    z, change = R_cam_sensor @ group.value, R_cam_sensor @ timing.change
+    u = state.x[TWIST : TWIST + 3] + np.cross(state.x[TWIST + 3 : TWIST + 6], r)
+    M = (1.0 + state.x[n + SCALE]) * np.eye(3) + _cross(state.x[n + MOUNT : n + VELOCITY_DELAY])
     errors = np.zeros((3, ERRORS))
-    errors[:, SCALE], errors[:, MOUNT:DEPTH] = u, -_cross(u)
+    errors[:, SCALE], errors[:, MOUNT:VELOCITY_DELAY], errors[:, VELOCITY_DELAY] = u, -_cross(u), -change
     swing = _swing_s(dock.position_m, dock.velocity_m_s), _swing_s(dock.angle_deg, dock.rate_deg_s)
     rocking = dock.velocity_m_s**2 * timing.repeats(swing[0])
     rocking += (math.radians(dock.rate_deg_s) * float(np.linalg.norm(state.t))) ** 2 * timing.repeats(swing[1])
-    var = group.sigma**2 + timing.delay_var(how.delay_sigma_s) + rocking
+    var = group.sigma**2 + timing.var * (how.delay_sigma_s + timing.late_s) ** 2 + rocking
     columns = np.concatenate([np.arange(TWIST, TWIST + 6), n + np.arange(SCALE, DEPTH)])
     H = np.hstack([M, -M @ _cross(r), errors[:, SCALE:DEPTH]])
-    return _Model(SensorRows(columns, H, z - M @ u, np.full(3, var)), errors, 3)
+    expected = u + errors @ state.x[n:] - change * timing.late_s
+    parts = _only(SCALE), slice(MOUNT, VELOCITY_DELAY)
+    return _Model(SensorRows(columns, H, z - expected, np.full(3, var)), errors, 3, parts, VELOCITY_DELAY)
 
 
 def _depth(one: Track, group: Group, timing: _Timing, config: AidingConfig) -> _Model:
@@ -430,11 +464,11 @@ def _depth(one: Track, group: Group, timing: _Timing, config: AidingConfig) -> _
     errors[0, DEPTH], errors[0, UP:] = 1.0, -p[[0, 2]]
     swing_s = _swing_s(dock.angle_deg, dock.rate_deg_s)
     rocking = (math.radians(dock.angle_deg) * float(np.linalg.norm(p))) ** 2 + dock.position_m**2
-    var = group.sigma**2 + timing.change2 * timing.late_s**2 + rocking * timing.repeats(swing_s)
+    var = group.sigma**2 + float(timing.change @ timing.change) * timing.late_s**2 + rocking * timing.repeats(swing_s)
     columns = np.concatenate([np.arange(6), n + np.arange(DEPTH, ERRORS)])
     H = np.concatenate([up, np.cross(p, up), errors[0, DEPTH:]])[None]
     residual = np.array([group.value[0] - (state.x[n + DEPTH] - up @ p)])
-    return _Model(SensorRows(columns, H, residual, np.array([var])), errors, 1)
+    return _Model(SensorRows(columns, H, residual, np.array([var])), errors, 1, (slice(DEPTH, ERRORS),))
 
 
 def _tilt(one: Track, group: Group, timing: _Timing, config: AidingConfig) -> _Model:
@@ -446,11 +480,11 @@ def _tilt(one: Track, group: Group, timing: _Timing, config: AidingConfig) -> _M
     errors = np.zeros((3, ERRORS))
     errors[:, UP:] = state.R[:, [0, 2]]
     rocking = math.radians(dock.angle_deg) ** 2 * timing.repeats(_swing_s(dock.angle_deg, dock.rate_deg_s))
-    var = group.sigma**2 + timing.change2 * timing.late_s**2 + rocking
+    var = group.sigma**2 + float(timing.change @ timing.change) * timing.late_s**2 + rocking
     columns = np.concatenate([np.arange(3, 6), n + np.arange(UP, ERRORS)])
     H = np.hstack([-state.R @ _cross(up), errors[:, UP:]])
     residual = z * (float(np.linalg.norm(up)) / float(np.linalg.norm(z))) - state.R @ up
-    return _Model(SensorRows(columns, H, residual, np.full(3, var)), errors, 2)
+    return _Model(SensorRows(columns, H, residual, np.full(3, var)), errors, 2, (slice(UP, ERRORS),))
 
 
 def _cross(a: Array) -> Array:

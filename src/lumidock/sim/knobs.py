@@ -289,6 +289,6 @@ class AidingKnobs(KnobSection):
     """The vehicle's own sensors; none unless given, `{}` for one with the errors that the localizer's settings hold."""
 
     gyro: Annotated[SensorKnobs | None, _sensor(rate_hz=50.0, noise=0.001, bias=0.0052)] = None  # bias 0.3 degrees/s
-    velocity: Annotated[SensorKnobs | None, _sensor(rate_hz=5.0, noise=0.01, scale=0.01, mount_deg=2.0)] = None
+    velocity: Annotated[SensorKnobs | None, _sensor(rate_hz=5.0, noise=0.01, scale=0.03, mount_deg=2.0)] = None
     depth: Annotated[SensorKnobs | None, _sensor(rate_hz=10.0, noise=0.01, bias=2.0)] = None
     tilt: Annotated[SensorKnobs | None, _sensor(rate_hz=20.0, noise=0.005, mount_deg=1.0)] = None
