@@ -45,7 +45,10 @@ _PROVEN_S = 3.0  # of agreement, in which noise and delay show too
 _MATTERS = 0.01  # share of the largest variance, below which one does nothing
 _CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 _TOLD_SHARE = 0.02  # least share of a declared variance that measurements removed; below it nothing is told
-_JUMPS, _FORGIVEN = 5.0, 0.25  # groups in a row that are refused before a sensor is declined; what a good one takes back
+_JUMPS, _FORGIVEN = (
+    5.0,
+    0.25,
+)  # groups in a row that are refused before a sensor is declined; what a good one takes back
 _NEVER = -(2**62)  # ns
 
 
@@ -97,6 +100,9 @@ class AidingState:
             test.proven and not test.declined and not _is_silent(test, t_ns)
             for test in (self.test_of("gyro"), self.test_of("velocity"))
         )
+
+
+NO_AIDING = AidingState()
 
 
 def _is_silent(test: SensorTest, t_ns: int) -> bool:
@@ -194,9 +200,14 @@ def _swing_s(amplitude: float, rate: float) -> float:
 
 
 def _delay_s(kind: SensorKind, config: AidingConfig) -> float:
-    if kind == "attitude":
-        return 0.0
-    return {"gyro": config.gyro, "velocity": config.velocity, "depth": config.depth, "tilt": config.tilt}[kind].delay_s
+    """By how much the stamps of a sensor are late, s."""
+    delay_s: dict[SensorKind, float] = {
+        "gyro": config.gyro.delay_s,
+        "velocity": config.velocity.delay_s,
+        "depth": config.depth.delay_s,
+        "tilt": config.tilt.delay_s,
+    }
+    return delay_s.get(kind, 0.0)
 
 
 def _due(

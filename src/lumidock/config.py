@@ -320,7 +320,9 @@ class VelocityConfig(SettingsGroup):
     quat_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)  # of R_cam_sensor: the axes of its values in `cam`
     position_m: Vector = (0.0, 0.0, 0.0)  # of its transducers in `cam`
     mount_sigma_deg: PositiveFloat = 2.0  # by which the axes are off; a state of the filter
-    scale: PositiveFloat = 0.03  # relative error, most of it of the speed of sound (1 % is 15 m/s); a state of the filter
+    scale: PositiveFloat = (
+        0.03  # relative error, most of it of the speed of sound (1 % is 15 m/s); a state of the filter
+    )
     walk: PositiveFloat = 0.0002  # what a second adds to both, relative and rad
     delay_s: Annotated[float, Field(ge=-2.0, le=2.0)] = 0.0  # by which its stamps are late
     delay_sigma_s: PositiveFloat = 0.1

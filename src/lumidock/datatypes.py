@@ -97,7 +97,7 @@ class AidingMeasurement:
             raise DataError(f"{self.kind} has value {self.value}, wanted {wanted} finite numbers")
         if not self.sigma > 0.0:
             raise DataError(f"{self.kind} has sigma {self.sigma:g}, wanted a positive one")
-        if self.kind in ("tilt", "attitude") and not math.hypot(*self.value) > 1e-6:  # noqa: PLR2004
+        if self.kind in ("tilt", "attitude") and not math.hypot(*self.value) > 1e-6:
             raise DataError(f"{self.kind} has a value of no length")
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lumidock.aiding import AidingState
+from lumidock.aiding import NO_AIDING, AidingState
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Stage
@@ -59,7 +59,7 @@ class LocalizerState:
     stage: Stage = "search"
     last: Detections | None = None
     calibration: CalibrationStates | None = None
-    aiding: AidingState = AidingState()
+    aiding: AidingState = NO_AIDING
     dark_frames: int = 0
 
     @property

@@ -11,7 +11,7 @@ import numpy as np
 from lumidock import aiding, track, verify
 from lumidock._kernels.measurements import Measurements
 from lumidock._kernels.tracking.track import PredictedMeasurements
-from lumidock.aiding import AidingState
+from lumidock.aiding import NO_AIDING, AidingState
 from lumidock.datatypes import Array, Attitude
 from lumidock.light_counts import CHECKED_LIGHTS
 from lumidock.model import count_lamps
@@ -31,7 +31,7 @@ class Prediction:
     t_ns: int
     tracks: tuple[Track, ...]
     measurements: PredictedMeasurements | None
-    aiding: AidingState = AidingState()
+    aiding: AidingState = NO_AIDING
     deceived: bool = False
 
     def windows(self) -> Array | None:
