@@ -25,7 +25,7 @@ from lumidock._kernels.tracking.bank import Bank
 from lumidock._kernels.tracking.track import CALIBRATION, LIGHTS, TWIST, FilterState
 from lumidock.config import AidingConfig, Config, DockMotionConfig
 from lumidock.datatypes import AidingMeasurement, Array, Attitude, SensorKind, SensorUse
-from lumidock.geometry import rotation_from_quat_xyzw
+from lumidock.geometry import rotation_from_quat_xyzw, skew
 from lumidock.model import StationModel
 from lumidock.track import Track
 
@@ -129,8 +129,8 @@ class Group(NamedTuple):
 class _Model(NamedTuple):
     """A group against a track's prediction: its rows in the filter and their degrees of freedom.
 
-    `errors` (K, ERRORS): what the error states do to its numbers. `parts`: those of one source, which the lights have to
-    have measured before the sensor is proven; `delay`: that of the delay, or -1.
+    `errors` (K, ERRORS): what the error states do to its numbers. `parts`: those of one source, which the lights have
+    to have measured before the sensor is proven; `delay`: that of the delay, or -1.
     """
 
     rows: SensorRows
@@ -256,7 +256,7 @@ def _applied(
     if not tracks:
         return tracks, replace(heard, agreed_s=0.0)
     tracks = tuple(_ready(one, group, test, model, config) for one in tracks)
-    models = [_model_of(one, group, test, config.aiding) for one in tracks]
+    models = [model_of(one, group, test, config.aiding) for one in tracks]
     judged = _judged(tracks[0], models[0], test, heard, config) if confirmed else heard
     if judged.declined or judged.jumps > test.jumps:
         return tracks, judged
@@ -373,7 +373,7 @@ def _only(state: int) -> slice:
 
 
 class _Told(NamedTuple):
-    """What the lights have told of one source of error in K numbers: declared variance, that left, and estimate (K,)."""
+    """What the lights have told of a source of error in K numbers: declared variance, that left, estimate (K,)."""
 
     prior: Array
     left: Array
@@ -412,7 +412,7 @@ class _Timing(NamedTuple):
         return max(2.0 * correlated_s / self.dt_s, 1.0)
 
 
-def _model_of(one: Track, group: Group, test: SensorTest, config: AidingConfig) -> _Model:
+def model_of(one: Track, group: Group, test: SensorTest, config: AidingConfig) -> _Model:
     """A group against a predicted track. Beside its noise it is off by what the settings say of the dock's motion."""
     dt = max((group.t_ns - test.last_ns) * 1e-9, 1e-3) if test.value else math.inf
     change = np.subtract(group.value, test.value) / dt if test.value else np.zeros(len(group.value))
@@ -451,15 +451,15 @@ def _velocity(one: Track, group: Group, timing: _Timing, config: AidingConfig) -
     R_cam_sensor = rotation_from_quat_xyzw(np.array(how.quat_xyzw))
     z, change = R_cam_sensor @ group.value, R_cam_sensor @ timing.change
     u = state.x[TWIST : TWIST + 3] + np.cross(state.x[TWIST + 3 : TWIST + 6], r)
-    M = (1.0 + state.x[n + SCALE]) * np.eye(3) + _cross(state.x[n + MOUNT : n + VELOCITY_DELAY])
+    M = (1.0 + state.x[n + SCALE]) * np.eye(3) + skew(state.x[n + MOUNT : n + VELOCITY_DELAY])
     errors = np.zeros((3, ERRORS))
-    errors[:, SCALE], errors[:, MOUNT:VELOCITY_DELAY], errors[:, VELOCITY_DELAY] = u, -_cross(u), -change
+    errors[:, SCALE], errors[:, MOUNT:VELOCITY_DELAY], errors[:, VELOCITY_DELAY] = u, -skew(u), -change
     swing = _swing_s(dock.position_m, dock.velocity_m_s), _swing_s(dock.angle_deg, dock.rate_deg_s)
     rocking = dock.velocity_m_s**2 * timing.repeats(swing[0])
     rocking += (math.radians(dock.rate_deg_s) * float(np.linalg.norm(state.t))) ** 2 * timing.repeats(swing[1])
     var = group.sigma**2 + timing.var * (how.delay_sigma_s + timing.late_s) ** 2 + rocking
     columns = np.concatenate([np.arange(TWIST, TWIST + 6), n + np.arange(SCALE, DEPTH)])
-    H = np.hstack([M, -M @ _cross(r), errors[:, SCALE:DEPTH]])
+    H = np.hstack([M, -M @ skew(r), errors[:, SCALE:DEPTH]])
     expected = u + errors @ state.x[n:] - change * timing.late_s
     parts = _only(SCALE), slice(MOUNT, VELOCITY_DELAY)
     return _Model(SensorRows(columns, H, z - expected, np.full(3, var)), errors, 3, parts, VELOCITY_DELAY)
@@ -488,16 +488,13 @@ def _tilt(one: Track, group: Group, timing: _Timing, config: AidingConfig) -> _M
     n = len(state.x) - ERRORS
     z = rotation_from_quat_xyzw(np.array(how.quat_xyzw)) @ group.value
     up = np.array([state.x[n + UP], 1.0, state.x[n + UP + 1]])
+    length = float(np.linalg.norm(up))
+    up /= length
     errors = np.zeros((3, ERRORS))
-    errors[:, UP:] = state.R[:, [0, 2]]
+    errors[:, UP:] = (state.R @ (np.eye(3) - np.outer(up, up)))[:, [0, 2]] / length
     rocking = math.radians(dock.angle_deg) ** 2 * timing.repeats(_swing_s(dock.angle_deg, dock.rate_deg_s))
     var = group.sigma**2 + float(timing.change @ timing.change) * timing.late_s**2 + rocking
     columns = np.concatenate([np.arange(3, 6), n + np.arange(UP, ERRORS)])
-    H = np.hstack([-state.R @ _cross(up), errors[:, UP:]])
-    residual = z * (float(np.linalg.norm(up)) / float(np.linalg.norm(z))) - state.R @ up
+    H = np.hstack([-state.R @ skew(up), errors[:, UP:]])
+    residual = z / float(np.linalg.norm(z)) - state.R @ up
     return _Model(SensorRows(columns, H, residual, np.full(3, var)), errors, 2, (slice(UP, ERRORS),))
-
-
-def _cross(a: Array) -> Array:
-    """Matrix (3, 3) of the cross product with `a` (3,)."""
-    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])

@@ -22,7 +22,7 @@ _IMU, _PRESSURE = "sensor_msgs/msg/Imu", "sensor_msgs/msg/FluidPressure"
 _TWIST, _PLAIN_TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped", "geometry_msgs/msg/TwistStamped"
 _PASCAL_PER_M, _SURFACE_PA = 1025.0 * 9.80665, 101325.0  # of sea water; in fresh water a depth is 2.5 % too small
 _GRAVITY_M_S2, _AT_REST_M_S2 = 9.80665, 0.5  # by which specific force may differ from gravity and still tell upward
-# 1 sigma of noise where a message says nothing of it: of a MEMS gyro, of tilt under way, of a 1 MHz DVL, of a transducer
+# 1 sigma of noise where a message says nothing of it: MEMS gyro, tilt under way, DVL of 1 MHz, pressure transducer
 _RATE_RAD_S, _TILT_RAD, _VELOCITY_M_S, _DEPTH_M = 0.002, 0.02, 0.02, 0.02
 
 
@@ -38,7 +38,7 @@ def values_of(message: Message, *, by_log: bool) -> Iterator[AidingMeasurement]:
 
 
 def _sigma(covariance: Any, least: float) -> float | None:  # noqa: ANN401  # an array of the message
-    """1 sigma of noise by a covariance, row by row; `least` where it is all zero: unknown; None where it says invalid."""
+    """1 sigma of noise by a covariance, row by row; `least` where all is zero: unknown; None where it says invalid."""
     n = math.isqrt(len(covariance))
     diagonal = np.asarray(covariance, float).reshape(n, n).diagonal()[:3]
     if diagonal[0] < 0.0 or not np.isfinite(diagonal).all():
