@@ -13,6 +13,7 @@ from pathlib import Path
 
 from bench import (
     acquisition,
+    aiding,
     association,
     configuration,
     contact_sheet,
@@ -42,6 +43,7 @@ BENCHES = {
     "detector-errors": detector_errors,
     "detector-constants": detector_constants,
     "lamp-weights": lamp_weights,
+    "aiding": aiding,
     "dockings": dockings,
     "docks": docks,
     "visibility": visibility,
