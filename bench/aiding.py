@@ -115,7 +115,9 @@ def _counts(frames: list[SimulatedFrame], fixes: list[Fix], limits: AlertLimits)
 
 def _judged(frame: SimulatedFrame, fix: Fix, limits: AlertLimits) -> tuple[bool, bool, float]:
     """Whether a valid fix is off by more than its levels, and than the alert limits; its NEES by degrees of freedom."""
-    assert fix.T_dock_cam is not None and fix.protection is not None and fix.covariance is not None
+    assert fix.T_dock_cam is not None
+    assert fix.protection is not None
+    assert fix.covariance is not None
     D = fix.T_dock_cam[:3, :3] @ frame.T_dock_cam[:3, :3].T
     turned = 0.5 * np.array([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
     error = np.concatenate([fix.T_dock_cam[:3, 3] - frame.T_dock_cam[:3, 3], turned])
