@@ -1,5 +1,7 @@
 """The flat port: against Snell's law traced by bisection, against finite differences, and the kernels against numpy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bench.shipped import shipped_station
@@ -12,6 +14,8 @@ from lumidock.errors import InputError
 from lumidock.geometry import se3_exp, se3_inverse, se3_log
 from lumidock.port import FlatPort
 from lumidock.pose import project_lights, solve_pose, sqpnp
+from lumidock.setup.calibration_files import write_calibration
+from lumidock.streams.calibration_check import check
 
 K = np.array([[1110.0, 0.0, 648.0], [0.0, 1105.0, 471.0], [0.0, 0.0, 1.0]])
 PORT = FlatPort(0.06, 1.34, 0.012, 1.5)
@@ -106,3 +110,15 @@ def test_the_file_keeps_the_port(tmp_path):
     path.write_text(path.read_text().replace("kind: flat", "kind: dome"))
     with pytest.raises(InputError, match="port"):
         load_camera(path)
+
+
+def test_formats_without_words_for_a_port_are_refused(tmp_path):
+    for form in ("kalibr", "opencv"):
+        with pytest.raises(InputError, match="flat port"):
+            write_calibration(CAMERAS["plumb_bob"], tmp_path / "out.yaml", form)
+
+
+def test_a_lens_in_air_behind_a_stated_port_is_no_calibration_in_air():
+    in_air = Camera(1280, 960, K, "plumb_bob", np.array([-0.21, 0.06, 0.0, 0.0, 0.0]))
+    assert any("air" in text for text in check(in_air).warnings)
+    assert not check(replace(in_air, port=PORT)).warnings
