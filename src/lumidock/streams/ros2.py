@@ -131,7 +131,8 @@ def messages(
     if fix.velocity is not None:
         yield _serialized(f"{PREFIX}/velocity", t_ns, _twist_stamped(fix.velocity, t_ns, frames))
     if picture and isinstance(item, Frame):
-        yield _serialized(f"{PREFIX}/camera_info", t_ns, _camera_info(camera, t_ns, frames))
+        if camera.port is None:  # CameraInfo has no words for a port
+            yield _serialized(f"{PREFIX}/camera_info", t_ns, _camera_info(camera, t_ns, frames))
         yield _serialized(f"{PREFIX}/image/compressed", t_ns, _compressed(item, t_ns, frames))
         yield _serialized(f"{PREFIX}/annotations", t_ns, _annotations(fix, t_ns, light_ids))
 
