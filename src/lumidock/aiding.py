@@ -45,6 +45,7 @@ _PROVEN_S = 3.0  # of agreement, in which noise and delay show too
 _MATTERS = 0.01  # share of the largest variance, below which one does nothing
 _CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 _TOLD_SHARE = 0.02  # least share of a declared variance that measurements removed; below it nothing is told
+_DRIFT_MEMORY, _MAX_DRIFT = 0.97, 4.9  # 30 groups: 6 s of a DVL; two-sided normal, 1e-6
 _JUMPS, _FORGIVEN = (
     5.0,
     0.25,
@@ -57,7 +58,8 @@ class SensorTest:
     """How a sensor has stood up to the lights so far.
 
     `last_ns` of its last group, which had the mean `value`; `agreed_s`: how long it has agreed; `jumps`: groups refused
-    of late; `mean_deviate`: exponential mean of the innovations as normal deviates.
+    of late; `mean_deviate`: exponential mean of their NIS as normal deviates; `drift`: that of the innovations
+    themselves, number by number, which is zero for a sensor without a bias. Both are scaled to unit variance.
     """
 
     kind: SensorKind
@@ -66,6 +68,7 @@ class SensorTest:
     agreed_s: float = 0.0
     jumps: float = 0.0
     mean_deviate: float = 0.0
+    drift: tuple[float, ...] = ()
     proven: bool = False
     declined: str = ""
 
@@ -346,8 +349,11 @@ def _judged(one: Track, against: _Model, test: SensorTest, heard: SensorTest, co
         jumps = test.jumps + 1.0
         return replace(heard, jumps=jumps, agreed_s=0.0, declined="jumps" if jumps >= _JUMPS else "")
     mean = track.mean_of(test.mean_deviate, deviate, how.deviate_memory)
-    lying = "noise" if mean > how.max_mean_deviate else ""
-    return replace(heard, jumps=max(test.jumps - _FORGIVEN, 0.0), mean_deviate=mean, declined=lying)
+    before = test.drift or (0.0,) * len(residual)
+    normal = (residual / np.sqrt(np.diagonal(S))).tolist()
+    drift = tuple(track.mean_of(old, new, _DRIFT_MEMORY) for old, new in zip(before, normal, strict=True))
+    lying = "noise" if mean > how.max_mean_deviate else "bias" if max(map(abs, drift)) > _MAX_DRIFT else ""
+    return replace(heard, jumps=max(test.jumps - _FORGIVEN, 0.0), mean_deviate=mean, drift=drift, declined=lying)
 
 
 def _proven(one: Track, against: _Model, before: SensorTest, test: SensorTest, config: Config) -> SensorTest:
