@@ -46,6 +46,7 @@ _MATTERS = 0.01  # share of the largest variance, below which one does nothing
 _CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 _TOLD_SHARE = 0.02  # least share of a declared variance that measurements removed; below it nothing is told
 _DRIFT_MEMORY, _MAX_DRIFT = 0.97, 4.9  # 30 groups: 6 s of a DVL; two-sided normal, 1e-6
+_DOUBTED_DRIFT = 2.5  # two-sided normal, 1 %: a sensor that may have begun to lie carries nothing in the dark
 _JUMPS, _FORGIVEN = (
     5.0,
     0.25,
@@ -98,14 +99,19 @@ class AidingState:
         return tuple(_use(test, t_ns) for test in self.tests)
 
     def carries(self, t_ns: int) -> bool:
-        """Whether gyro and velocity are proven and not silent, so that a track lasts longer without a light."""
+        """Whether gyro and velocity are proven, not silent and not in doubt: then a track lasts longer without light."""
         return all(
-            test.proven and not test.declined and not _is_silent(test, t_ns)
+            test.proven and not test.declined and not _is_silent(test, t_ns) and _most(test.drift) < _DOUBTED_DRIFT
             for test in (self.test_of("gyro"), self.test_of("velocity"))
         )
 
 
 NO_AIDING = AidingState()
+
+
+def _most(numbers: tuple[float, ...]) -> float:
+    """The largest size among some numbers."""
+    return max(map(abs, numbers), default=0.0)
 
 
 def _is_silent(test: SensorTest, t_ns: int) -> bool:
@@ -349,10 +355,11 @@ def _judged(one: Track, against: _Model, test: SensorTest, heard: SensorTest, co
         jumps = test.jumps + 1.0
         return replace(heard, jumps=jumps, agreed_s=0.0, declined="jumps" if jumps >= _JUMPS else "")
     mean = track.mean_of(test.mean_deviate, deviate, how.deviate_memory)
-    before = test.drift or (0.0,) * len(residual)
-    normal = (residual / np.sqrt(np.diagonal(S))).tolist()
-    drift = tuple(track.mean_of(old, new, _DRIFT_MEMORY) for old, new in zip(before, normal, strict=True))
-    lying = "noise" if mean > how.max_mean_deviate else "bias" if max(map(abs, drift)) > _MAX_DRIFT else ""
+    drift = test.drift or (0.0,) * len(residual)
+    if one.last.n_used:  # without lights a track agrees with its sensors
+        normal = (residual / np.sqrt(np.diagonal(S))).tolist()
+        drift = tuple(track.mean_of(old, new, _DRIFT_MEMORY) for old, new in zip(drift, normal, strict=True))
+    lying = "noise" if mean > how.max_mean_deviate else "bias" if _most(drift) > _MAX_DRIFT else ""
     return replace(heard, jumps=max(test.jumps - _FORGIVEN, 0.0), mean_deviate=mean, drift=drift, declined=lying)
 
 
