@@ -46,7 +46,7 @@ _MATTERS = 0.01  # share of the largest variance, below which one does nothing
 _CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 _TOLD_SHARE = 0.02  # least share of a declared variance that measurements removed; below it nothing is told
 _DRIFT_MEMORY, _MAX_DRIFT = 0.97, 4.9  # 30 groups: 6 s of a DVL; two-sided normal, 1e-6
-_DOUBTED_DRIFT = 2.5  # two-sided normal, 1 %: a sensor that may have begun to lie carries nothing in the dark
+_DOUBTED = 2.5  # two-sided normal, 1 %: a sensor that may have begun to lie carries nothing in the dark
 _JUMPS, _FORGIVEN = (
     5.0,
     0.25,
@@ -101,7 +101,7 @@ class AidingState:
     def carries(self, t_ns: int) -> bool:
         """Whether gyro and velocity are proven, not silent and not in doubt: then a track lasts longer without light."""
         return all(
-            test.proven and not test.declined and not _is_silent(test, t_ns) and _most(test.drift) < _DOUBTED_DRIFT
+            test.proven and not test.declined and not _is_silent(test, t_ns) and _most(test.drift) < _DOUBTED
             for test in (self.test_of("gyro"), self.test_of("velocity"))
         )
 
