@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from tests.tracks import CAMERA, STATION, frames_of
+from tracks import CAMERA, STATION, frames_of
 
 from lumidock import AidingMeasurement, Config, DataError, Localizer, aiding, track
 from lumidock._kernels.tracking import track as kernel
@@ -204,7 +204,7 @@ def test_velocity_is_that_of_the_camera():
     fixes = play(frames)
     nees, errors = [], []
     for a, b, fix in zip(frames, frames[1:], fixes, strict=False):
-        if fix.velocity is not None and fix.valid:
+        if fix.valid and a.T_dock_cam[2, 3] < 5.0:
             dt = (b.detections.t_ns - a.detections.t_ns) * 1e-9
             true = a.T_dock_cam[:3, :3].T @ (b.T_dock_cam[:3, 3] - a.T_dock_cam[:3, 3]) / dt
             error = fix.velocity.linear_m_s - true

@@ -4,9 +4,9 @@ import csv
 
 import numpy as np
 import pytest
+from bags import header, raw, write
 from numpy.testing import assert_allclose
-from tests.bags import header, raw, write
-from tests.tracks import CAMERA, ROOT, STATION
+from tracks import CAMERA, ROOT, STATION
 
 from lumidock import AidingMeasurement, Config, Localizer
 from lumidock.app.run import Setup, run

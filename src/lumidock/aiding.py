@@ -99,7 +99,7 @@ class AidingState:
         return tuple(_use(test, t_ns) for test in self.tests)
 
     def carries(self, t_ns: int) -> bool:
-        """Whether gyro and velocity are proven, not silent and not in doubt: then a track lasts longer without light."""
+        """Whether gyro and velocity are proven, heard and not in doubt: then a track lasts longer without light."""
         return all(
             test.proven and not test.declined and not _is_silent(test, t_ns) and _most(test.drift) < _DOUBTED
             for test in (self.test_of("gyro"), self.test_of("velocity"))

@@ -55,7 +55,7 @@ from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
-from lumidock.streams.sensors import AidingFeed
+from lumidock.streams.sensors import AidingFeed, SensorFeed
 from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, open_rerun
 from lumidock.streams.source import Reading, Source
 from lumidock.streams.vehicle import load_vehicle
@@ -75,6 +75,12 @@ LiveSource = Annotated[
 MavlinkOption = Annotated[
     str | None,
     typer.Option("--mavlink", metavar="HOST:PORT", help="Send VISION_POSITION_ESTIMATE by UDP; needs --vehicle."),
+]
+SensorsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--sensors", metavar="HOST:PORT", help="Listen there for ATTITUDE and VISION_POSITION_DELTA by UDP, as aiding."
+    ),
 ]
 ZenohOption = Annotated[
     str | None,
@@ -120,6 +126,7 @@ def _serve(
     config: ConfigOption = None,
     loop: Annotated[bool, typer.Option("--loop", help="Show a recording again and again.")] = False,
     mavlink: MavlinkOption = None,
+    sensors: SensorsOption = None,
     zenoh: ZenohOption = None,
     dds: Annotated[bool, typer.Option("--dds", help="Publish to ROS 2 by DDS.")] = False,
     domain: Annotated[int, typer.Option(metavar="N", min=0, max=232, help="ROS_DOMAIN_ID.")] = 0,
@@ -153,6 +160,8 @@ def _serve(
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
         ]
         server = _server(opened, _ready_localizer(method, setting, settings), setting.camera, sinks, loop=loop)
+        if sensors is not None:
+            server.feed = _listening(stack, sensors)
         page = _health_page(host, health_port, server)
         stack.callback(page.close)
         # last of all, so that a start that fails leaves what is on the disk alone
@@ -235,6 +244,19 @@ def _vehicle_sinks(
             from lumidock.streams.ddslink import DdsLink
         workers.append(Worker("dds", partial(DdsLink, dds, host != _LOOPBACK, *shared), queue=_SHORT))
     return workers
+
+
+def _listening(stack: ExitStack, sensors: str) -> SensorFeed:
+    """The sensors of an autopilot, until the stack is closed."""
+    with extra("mavlink"):
+        from lumidock.streams.mavlink_sensors import MavlinkSensors
+    host, port = _host_and_port("--sensors", sensors)
+    try:
+        feed = MavlinkSensors(host, port)
+    except OSError as error:
+        raise InputError(f"--sensors {sensors}: {error.strerror or error}") from None
+    stack.callback(feed.close)
+    return feed
 
 
 def _viewer_sinks(setting: Setting, foxglove_port: int | None, rerun: str | None, host: str) -> list[Worker]:
