@@ -9,7 +9,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -143,27 +143,24 @@ def _serve(
     """Localize live and send every fix to the vehicle, until stopped."""
     require_method(method)
     settings = load_config(config) if config else Config()
-    mounting = load_vehicle(vehicle) if vehicle else None
     with ExitStack() as stack:
         if source.startswith(SIM):
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            source = str(simulated(source, folder / "sequence", station, camera))
+            folder = stack.enter_context(tempfile.TemporaryDirectory())
+            source = str(simulated(source, Path(folder) / "sequence", station, camera))
         reading = Reading(fps, topic, info_topic, bits, as_stored=as_stored, trusted=trust_calibration)
         reading = replace(reading, follow_calibration=camera is None)
         opened = open_any(source, reading, delay_ms=delay_ms, station=station)
         station_file = file_of("station", station, opened.station, opened)
         calibration = calibration_of(camera, opened, name=camera_name, trusted=trust_calibration)
         tell((*opened.notes, *calibration.warnings))
-        setting = Setting(load_station(station_file), calibration.camera, mounting)
+        setting = Setting(load_station(station_file), calibration.camera, load_vehicle(vehicle) if vehicle else None)
         sinks = [
             *_vehicle_sinks(setting, mavlink, zenoh, domain if dds else None, domain, host),
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
         ]
         server = _server(opened, _ready_localizer(method, setting, settings), setting.camera, sinks, loop=loop)
-        if sensors is not None:
-            server.feed = _listening(stack, sensors)
-        page = _health_page(host, health_port, server)
-        stack.callback(page.close)
+        server.feed = _sensor_feed(stack, opened, sensors)
+        page = stack.enter_context(closing(_health_page(host, health_port, server)))
         # last of all, so that a start that fails leaves what is on the disk alone
         sinks += _file_sinks(setting, station_file, out, record or [], force)
         print(f"health at http://{host}:{page.port}/", file=sys.stderr if as_json else sys.stdout, flush=True)
@@ -188,7 +185,7 @@ def _server(opened: Source, localizer: methods.Method, lens: Camera, sinks: list
     stop, newest = threading.Event(), Newest()
     read = partial(opened.items, (lens.width, lens.height))
     reader = SourceReader(read, newest, live=opened.live, loop=loop, stop=stop)
-    return Server(localizer, reader, newest, sinks, stop, feed=AidingFeed(opened.sensors()))
+    return Server(localizer, reader, newest, sinks, stop)
 
 
 def _print_counts(server: Server, as_json: bool) -> None:
@@ -246,8 +243,10 @@ def _vehicle_sinks(
     return workers
 
 
-def _listening(stack: ExitStack, sensors: str) -> SensorFeed:
-    """The sensors of an autopilot, until the stack is closed."""
+def _sensor_feed(stack: ExitStack, opened: Source, sensors: str | None) -> SensorFeed:
+    """The sensors of an autopilot, until the stack is closed; else those of a recording."""
+    if sensors is None:
+        return AidingFeed(opened.sensors())
     with extra("mavlink"):
         from lumidock.streams.mavlink_sensors import MavlinkSensors
     host, port = _host_and_port("--sensors", sensors)
