@@ -167,15 +167,24 @@ def assess(
         n_seen=len(detections),
         n_used=used,
         T_dock_cam=bound.T_dock_cam if valid else None,
-        reason="" if valid else doubt or "protection",
+        reason="" if valid else doubt or _why_wide(state, config),
         match=Match(detections, light_of(first.last.assignment, len(detections))),
         covariance=bound.covariance if valid else None,
         protection=bound.protection if valid else None,
         guide=bound.guide if not doubt and guide_holds(bound, limits) else None,
         nis=first.last.nis / (2 * used) if status == "tracking" else math.nan,
-        alternatives=alternatives(state.hypotheses) if doubt in _OPEN else (),
+        alternatives=alternatives(state.hypotheses)
+        if not valid and (doubt or _why_wide(state, config)) in _OPEN
+        else (),
     )
     return fix, state
+
+
+def _why_wide(state: LocalizerState, config: IntegrityConfig) -> str:
+    """The word for levels that are too wide: another association that has to be held possible, or few lights."""
+    first, *others = state.hypotheses
+    rivals = [one for one in others if first.log_weight - one.log_weight < -math.log(config.risk)]
+    return "ambiguous" if any(contradict(first.last.assignment, r.last.assignment) for r in rivals) else "protection"
 
 
 def alternatives(tracks: Sequence[Track]) -> tuple[Alternative, ...]:

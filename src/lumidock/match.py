@@ -37,12 +37,13 @@ from lumidock.camera import Camera
 from lumidock.config import MatchConfig
 from lumidock.datatypes import Array, Indices
 from lumidock.light_counts import CHECKED_LIGHTS, LAYER_LIGHTS, POSE_LIGHTS
-from lumidock.model import LEAST_P_LIGHT, AttitudePrior, StationModel, light_of, weights
+from lumidock.model import LEAST_P_LIGHT, P_LAMP, AttitudePrior, StationModel, light_of, weights
 
 _LEVEL, _UPRIGHT = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])  # images in surface or floor; in a wall
 _NONE = -HUGE  # log evidence of what is impossible
 _MAX_RELABELLINGS = 4  # each betters the evidence; more than two have not been seen
 _OPEN_ROLL_RAD = math.radians(45.0)  # 1 sigma; of a roll less known than this a steady vehicle says nothing
+_ANY_COSINE = 2.0  # of a roll that nothing bounds; so is its negative
 _AROUND = 0.25  # of the width of the assigned detections: how far around them others crowd
 
 
@@ -116,13 +117,48 @@ def acquire(
         return _renumbered(acquire(part, model, camera, prior, config, all_mirrors=all_mirrors), likely)
     task = _Search(_problem(frame, model, camera, prior, config), model, config)
     found, complete = _search(task, task.problem, POSE_LIGHTS, CHECKED_LIGHTS, POSE_LIGHTS)
+    tasks = [task]
+    if complete and prior.any_roll > 0.0 and config.roll_gate * prior.roll_rad < math.pi:
+        rolled = _Search(_rolled(task.problem, prior), model, config)
+        more, complete = _rivals_of_any_roll(rolled, found)
+        better = len(more.log_evidence) and more.log_evidence[0] > found.log_evidence.max(initial=_NONE)
+        tasks, found = [rolled, task] if better else [task, rolled], _merged(found, more)
     if not complete:
         return Acquisition((), (), 0.0, "too_many")
     if not len(found.log_evidence):
         return Acquisition((), (), 0.0, "too_few" if len(frame.uv) < POSE_LIGHTS else "ambiguous")
     first = Hypothesis(found.assignments[0], found.R[0], found.t[0], float(found.log_evidence[0]))
-    top, doubt = _relabelled(task, first)
-    return _decided(task, frame, found, top, doubt, _mirror_evidence(task, top, all_mirrors=all_mirrors))
+    top, doubt = _relabelled(tasks[0], first)
+    mirrors = [_mirror_evidence(one, top, all_mirrors=all_mirrors) for one in tasks]
+    return _decided(tasks[0], frame, found, top, doubt, float(np.logaddexp.reduce(mirrors)))
+
+
+def _rivals_of_any_roll(task: _Search, found: Hypotheses) -> tuple[Hypotheses, bool]:
+    """Hypotheses of any roll with as many lights as the best found so far; and whether the search came to its end.
+
+    Their prior is as small as a light is worth, so that with fewer lights they are out of the question.
+    """
+    config, few = task.config, len(task.problem.uv) <= task.config.max_detections_three
+    best = float(found.log_evidence.max(initial=_NONE))
+    lights = CHECKED_LIGHTS if few else CHECKED_LIGHTS + 1
+    if best + config.log_dock > config.margin:  # it may be an answer
+        lights = max(CHECKED_LIGHTS, int((found.assignments[0] >= 0).sum()))
+    of_a_layer = max(CHECKED_LIGHTS, math.ceil(lights / task.model.n_layers))
+    return _search(task, task.problem, lights, of_a_layer, best=best)
+
+
+def _merged(a: Hypotheses, b: Hypotheses) -> Hypotheses:
+    """Two lists of hypotheses as one, the best first."""
+    together = [np.concatenate(values) for values in zip(a, b, strict=True)]
+    best_first = np.argsort(-together[1], kind="stable")
+    return Hypotheses(*(values[best_first] for values in together))
+
+
+def _rolled(problem: Problem, prior: AttitudePrior) -> Problem:
+    """The same problem for a vehicle of any roll beyond that of the prior, its probability included."""
+    beyond = (problem.rules.roll_cosines[1], -_ANY_COSINE)
+    rules = problem.rules._replace(roll_cosines=beyond, steady=0.0, log_prior=math.log(prior.any_roll))
+    return problem._replace(info=prior.rolled().info, rules=rules)
 
 
 def _decided(
@@ -176,12 +212,17 @@ def _part(frame: Measurements, which: Indices) -> Measurements:
 
 
 def _likeliest(frame: Measurements, most: int) -> Indices | None:
-    """The detections (K,) that look most like lamps, `most` and those on a par; None where that leaves none out."""
-    least = LEAST_P_LIGHT
-    if len(frame.uv) > most:
-        least = max(least, float(np.partition(frame.p_light, -most)[-most]))
-    likely = np.flatnonzero(frame.p_light >= least)
-    return likely if len(likely) < len(frame.uv) else None
+    """The detections (K,) that look most like lamps, `most` and those on a par; None where that leaves none out.
+
+    Where too many are on a par, they stay only if they are rather lamps than not.
+    """
+    p_light, likely = frame.p_light, frame.p_light >= LEAST_P_LIGHT
+    if len(p_light) > most:
+        least = float(np.partition(p_light, -most)[-most])
+        likely &= p_light >= least
+        if likely.sum() > most and least < P_LAMP:
+            likely &= p_light > least
+    return None if likely.all() else np.flatnonzero(likely)
 
 
 def _renumbered(found: Acquisition, detections: Indices) -> Acquisition:
@@ -203,9 +244,8 @@ def _problem(
     offset = (frame.uv - lens[3:5]) * (0.5 * model.sigma_focal)
     var = frame.var + (offset**2).sum(axis=1)
     by_u: Indices = np.argsort(frame.uv[:, 0])
-    roll_rad = float(prior.info[2] ** -0.5)
     steady = prior.info * config.steadier**2
-    if roll_rad > _OPEN_ROLL_RAD:
+    if prior.roll_rad > _OPEN_ROLL_RAD:
         steady[2] = prior.info[2]
     return Problem(
         lens=lens,
@@ -225,11 +265,13 @@ def _problem(
         info=prior.info,
         steady=steady,
         rules=_rules(model, prior, config),
+        work=np.zeros(1, np.int64),
     )
 
 
 def _rules(model: StationModel, prior: AttitudePrior, config: MatchConfig) -> SearchRules:
-    tilt_var, roll_rad = float(1.0 / prior.info[:2].min()), float(prior.info[2] ** -0.5)
+    tilt_var, roll_rad = float(1.0 / prior.info[:2].min()), prior.roll_rad
+    gated = config.roll_gate * roll_rad < math.pi
     return SearchRules(
         log_volume=model.log_volume,
         detect=config.detect,
@@ -238,9 +280,10 @@ def _rules(model: StationModel, prior: AttitudePrior, config: MatchConfig) -> Se
         pair_gate=config.pair_gate,
         near_m=config.near_m,
         far_m=config.far_m,
-        roll_gate=min(config.roll_gate * roll_rad, math.pi),
+        roll_cosines=(_ANY_COSINE, math.cos(config.roll_gate * roll_rad) if gated else -_ANY_COSINE),
         bend=(config.bend * tilt_var) ** 2,
         steady=0.0 if prior.measured else config.steady,
+        log_prior=math.log1p(-prior.any_roll),
     )
 
 
@@ -257,23 +300,23 @@ def _search(task: _Search, problem: Problem, floor: int, *leasts: int, best: flo
     """Hypotheses of at least `floor` lights, best first, by searches that want ever fewer of one layer.
 
     A later search runs only where the one before left doubt and the detections are few. `best` is a log evidence to
-    measure up to. The second value says whether the search came to its end within its budget.
+    measure up to. The second value says whether the search came to its end, within the work that a frame may take.
     """
     k, m, count = task.config.hypotheses, len(problem.p), 0
     found = Hypotheses(np.empty((k, m), np.int64), np.empty(k), np.empty((k, 3, 3)), np.empty((k, 3)))
-    order, budget = task.model.order, np.array([task.config.max_pairs])
+    order, most_work = task.model.order, task.config.max_work
     for least in leasts:
         bounds = np.array([least, floor, floor, floor - 1 if floor > least else 0])
         reached = max(best, found.log_evidence[:count].max(initial=_NONE))
-        goal = Goal(bounds, budget, np.array([reached]))
+        goal = Goal(bounds, most_work, np.array([reached]))
         count = search(problem, order.pairs, order.unseen, goal, count, found)
-        sure = count > 0 and found.log_evidence[:count].max() > task.config.sure
+        sure = max(best, found.log_evidence[:count].max(initial=_NONE)) > task.config.sure
         if sure or len(task.problem.uv) > task.config.max_detections_three:
             break
     best_first = np.argsort(-found.log_evidence[:count], kind="stable")
     assignments, scores, R, t = found
     listed = Hypotheses(assignments[best_first], scores[best_first], R[best_first], t[best_first])
-    return listed, bool(budget[0] >= 0)
+    return listed, int(problem.work[0]) <= most_work
 
 
 def _relabelled(task: _Search, top: Hypothesis) -> tuple[Hypothesis, Doubt]:
