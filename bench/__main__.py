@@ -13,7 +13,9 @@ from pathlib import Path
 
 from bench import (
     acquisition,
+    acquisition_time,
     association,
+    bank,
     configuration,
     contact_sheet,
     detection,
@@ -33,6 +35,8 @@ from bench import (
 
 BENCHES = {
     "acquisition": acquisition,
+    "acquisition-time": acquisition_time,
+    "bank": bank,
     "nominal": nominal,
     "association": association,
     "table1": table1,

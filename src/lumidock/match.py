@@ -44,6 +44,7 @@ _NONE = -HUGE  # log evidence of what is impossible
 _MAX_RELABELLINGS = 4  # each betters the evidence; more than two have not been seen
 _OPEN_ROLL_RAD = math.radians(45.0)  # 1 sigma; of a roll less known than this a steady vehicle says nothing
 _ANY_COSINE = 2.0  # of a roll that nothing bounds; so is its negative
+_FEW = 10  # detections, among which four lights at any roll are searched for in a few ms
 _AROUND = 0.25  # of the width of the assigned detections: how far around them others crowd
 
 
@@ -92,6 +93,11 @@ class _Search:
     model: StationModel
     config: MatchConfig
 
+    @property
+    def expects_roll(self) -> bool:
+        """Whether it is about the expected roll, rather than about any other."""
+        return self.problem.rules.roll_cosines[0] == _ANY_COSINE
+
     def mirrored(self, by: Array) -> Problem:
         """The problem with the lights as a mirror shows them that turns the axes of the dock `by` (3,)."""
         return self.problem._replace(p=self.problem.p * by, axis=self.problem.axis * by)
@@ -129,22 +135,31 @@ def acquire(
         return Acquisition((), (), 0.0, "too_few" if len(frame.uv) < POSE_LIGHTS else "ambiguous")
     first = Hypothesis(found.assignments[0], found.R[0], found.t[0], float(found.log_evidence[0]))
     top, doubt = _relabelled(tasks[0], first)
-    mirrors = [_mirror_evidence(one, top, all_mirrors=all_mirrors) for one in tasks]
-    return _decided(tasks[0], frame, found, top, doubt, float(np.logaddexp.reduce(mirrors)))
+    asked = tasks if not tasks[0].expects_roll else tasks[:1]  # the prior of a rolled mirror image excludes it
+    mirrors = [_mirror_evidence(one, top, all_mirrors=all_mirrors) for one in asked]
+    if None in mirrors:
+        return Acquisition((), (), 0.0, "too_many")
+    return _decided(tasks[0], frame, found, top, doubt, float(np.logaddexp.reduce(np.array(mirrors, float))))
 
 
 def _rivals_of_any_roll(task: _Search, found: Hypotheses) -> tuple[Hypotheses, bool]:
     """Hypotheses of any roll with as many lights as the best found so far; and whether the search came to its end.
 
-    Their prior is as small as a light is worth, so that with fewer lights they are out of the question.
+    Their prior is as small as a light is worth, so that with fewer lights they are out of the question. An array that
+    fits itself when turned keeps its layers: so as many lights of one layer are wanted, too.
     """
-    config, few = task.config, len(task.problem.uv) <= task.config.max_detections_three
-    best = float(found.log_evidence.max(initial=_NONE))
-    lights = CHECKED_LIGHTS if few else CHECKED_LIGHTS + 1
+    config, best = task.config, float(found.log_evidence.max(initial=_NONE))
     if best + config.log_dock > config.margin:  # it may be an answer
-        lights = max(CHECKED_LIGHTS, int((found.assignments[0] >= 0).sum()))
-    of_a_layer = max(CHECKED_LIGHTS, math.ceil(lights / task.model.n_layers))
-    return _search(task, task.problem, lights, of_a_layer, best=best)
+        lights, of_a_layer = _counted(found.assignments[0], task.model)
+    else:
+        lights = of_a_layer = CHECKED_LIGHTS + int(len(task.problem.uv) > _FEW)
+    return _search(task, task.problem, max(lights, CHECKED_LIGHTS), max(of_a_layer, CHECKED_LIGHTS), best=best)
+
+
+def _counted(assignment: Indices, model: StationModel) -> tuple[int, int]:
+    """How many lights have a detection, and how many of the layer that has most."""
+    count = model.count(assignment)
+    return sum(count), max(count)
 
 
 def _merged(a: Hypotheses, b: Hypotheses) -> Hypotheses:
@@ -382,16 +397,18 @@ def _crowding(assignment: Indices, frame: Measurements, task: _Search) -> tuple[
     return unassigned, max(0.0, math.log(local * lens[6] * lens[7] / task.config.spurious))
 
 
-def _mirror_evidence(task: _Search, top: Hypothesis, *, all_mirrors: bool) -> float:
+def _mirror_evidence(task: _Search, top: Hypothesis, *, all_mirrors: bool) -> float | None:
     """Log evidence, prior included, that a mirror shows the array.
 
-    The water's surface does only where the image stands above the camera; a floor or a wall may do so anywhere.
+    The water's surface does only where the image stands above the camera; a floor or a wall may do so anywhere. None
+    where the search does not come to its end.
     """
-    n, total = top.n_assigned, _NONE
+    total, (n, of_a_layer) = _NONE, _counted(top.assignment, task.model)
+    least = min(n, CHECKED_LIGHTS) if task.expects_roll else max(of_a_layer, CHECKED_LIGHTS)
     for mirror in (_LEVEL, _UPRIGHT) if all_mirrors else (_LEVEL,):
-        found, complete = _search(task, task.mirrored(mirror), n, min(n, CHECKED_LIGHTS), best=top.log_evidence)
+        found, complete = _search(task, task.mirrored(mirror), n, least, best=top.log_evidence)
         if not complete:
-            return top.log_evidence
+            return None
         camera_y = -np.einsum("ki,ki->k", found.R[:, :, 1], found.t)
         possible = (camera_y < 0.0) | all_mirrors
         total = float(np.logaddexp.reduce([total, *found.log_evidence[possible]]))

@@ -33,6 +33,7 @@ HUGE = 1e300  # as a log evidence, negative: impossible
 _ELSEWHERE = 8.0  # log odds of two priors that one solution under both cannot reach
 STEPS = 6  # of Gauss-Newton, at most; from a pose that is nearly right two or three are enough
 FIT_WORK = 4  # units of work that a fit counts for; one is a pose of two pixels, checked against a layer's lights
+SCAN_WORK = 48  # detections that are looked through for a unit of work
 
 
 class SearchRules(NamedTuple):

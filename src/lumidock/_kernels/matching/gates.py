@@ -9,7 +9,7 @@ import numpy as np
 
 from lumidock._kernels.compiling import part
 from lumidock._kernels.lens import copy_to
-from lumidock._kernels.matching.evidence import HUGE, Candidate, Problem, innovation, survey_var
+from lumidock._kernels.matching.evidence import HUGE, SCAN_WORK, Candidate, Problem, innovation, survey_var
 from lumidock._kernels.pose import light_row
 from lumidock.datatypes import Array, Indices
 
@@ -69,7 +69,7 @@ def cheapest(
         problem.by_u,
     )
     found, near = 0, 0
-    problem.work[0] += 1
+    problem.work[0] += 1 + len(problem.uv) // SCAN_WORK
     for c in range(len(layer)):
         if not expected.sought[c] or rank[c] <= after:
             continue
@@ -122,7 +122,7 @@ def support(
     """
     rows, layer, uv, by_u = expected.rows, problem.layer, problem.uv, problem.by_u
     row, S, P2, shift, found = rows[c], np.empty(3), np.empty((6, 6)), np.empty(6), 0
-    problem.work[0] += 1
+    problem.work[0] += 1 + len(problem.uv) // SCAN_WORK
     S[0], S[1], S[2] = expected.S[c, 0] + problem.var[i], expected.S[c, 1], expected.S[c, 2] + problem.var[i]
     _condition(row, expected.P, S, uv[i, 0] - row[0], uv[i, 1] - row[1], P2, shift)
     taken[i] = c

@@ -9,7 +9,7 @@ import numpy as np
 
 from lumidock._kernels.compiling import part
 from lumidock._kernels.lens import invert6
-from lumidock._kernels.matching.evidence import Problem, SearchRules, innovation, survey_var
+from lumidock._kernels.matching.evidence import SCAN_WORK, Problem, SearchRules, innovation, survey_var
 from lumidock._kernels.matching.gates import Expected, occupied
 from lumidock._kernels.pose import light_row
 from lumidock.datatypes import Array, Indices
@@ -17,7 +17,6 @@ from lumidock.datatypes import Array, Indices
 SUPPORT, MERIT, LIGHTS, FIRST, SECOND, DEPTH, ROLL = range(7)  # columns of a list of tries
 MERITS = 8  # classes of tries with as many lights in place, by prior and looks
 _MERIT_STEP = 2.0  # of twice the log probability, from one class to the next; the last holds all of the prior's tail
-_ROW_WORK = 64  # pairs of detections whose geometry is looked at for a unit of work
 
 
 class Pair(NamedTuple):
@@ -85,7 +84,7 @@ def pair_poses(
         for o in range(3):
             d[k] += problem.Rp[o, k] * (problem.p[b, o] - problem.p[a, o])
     for i in range(n):
-        problem.work[0] += n // _ROW_WORK
+        problem.work[0] += n // SCAN_WORK
         for j in range(n):
             if i == j or not (problem.ray[i, 2] > 0.0 and problem.ray[j, 2] > 0.0):
                 continue
