@@ -321,7 +321,7 @@ def _search(task: _Search, problem: Problem, floor: int, *leasts: int, best: flo
     found = Hypotheses(np.empty((k, m), np.int64), np.empty(k), np.empty((k, 3, 3)), np.empty((k, 3)))
     order, most_work = task.model.order, task.config.max_work
     for least in leasts:
-        bounds = np.array([least, floor, floor, floor - 1 if floor > least else 0])
+        bounds = np.array([least, floor, floor, 0, 0])
         reached = max(best, found.log_evidence[:count].max(initial=_NONE))
         goal = Goal(bounds, most_work, np.array([reached]))
         count = search(problem, order.pairs, order.unseen, goal, count, found)

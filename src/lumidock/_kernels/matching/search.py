@@ -47,7 +47,7 @@ _STEPS_THREE = 2  # of Gauss-Newton for three lights, whose tilt is open: they p
 _CLOSE = 10.0  # log evidence; an association of one layer this far behind the best is still tried with the others
 
 
-LEAST, FLOOR, MOST, IN_LAYER = range(4)  # entries of `Goal.bounds`
+LEAST, FLOOR, MOST, IN_LAYER, LEVEL = range(5)  # entries of `Goal.bounds`
 
 
 class Hypotheses(NamedTuple):
@@ -66,9 +66,9 @@ class Hypotheses(NamedTuple):
 class Goal(NamedTuple):
     """What a search still looks for.
 
-    `bounds` (4,): the `LEAST` lights of one layer; the least in all (`FLOOR`); the `MOST` assigned so far, less one;
-    the most in one layer so far, less one (`IN_LAYER`). `most_work`: units of the problem's work at which it gives up.
-    `best` (1,): log evidence so far.
+    `bounds` (5,): the `LEAST` lights of one layer; the least in all (`FLOOR`); the `MOST` assigned so far, less one;
+    the most in one layer so far, less one (`IN_LAYER`); how many of one layer are wanted now (`LEVEL`). `most_work`:
+    units of the problem's work at which it gives up. `best` (1,): log evidence so far.
     """
 
     bounds: Indices
@@ -81,27 +81,28 @@ def search(problem: Problem, pairs: Indices, unseen: Indices, goal: Goal, count:
     """Add the best hypotheses to the `count` of a list; returns how many there are then.
 
     `pairs` (S, 2) are lights of one layer, in order; `unseen` (S,) is the most lights of one layer that a hypothesis
-    can assign without any pair before that one. Hypotheses that may have most lights of a layer are tried first: those
-    pairs of lights that no such hypothesis does without, and those detections for them that leave most others in
-    place. The search stops when what it has not seen cannot come within one light of the best, in all or in any one
-    layer, so that it is exhaustive in what matters; or, unfinished, when its work is done.
+    can assign without any pair before that one. Hypotheses are looked for level by level, those with most lights of a
+    layer first: by the pairs of lights that no such hypothesis does without, and by those detections for them that
+    leave enough others in place, most first. What is tried again on a lower level costs little: the more lights are
+    wanted, the sooner a try ends. The search stops when what it has not seen cannot come within one light of the best,
+    in all or in any one layer, so that it is exhaustive in what matters; or, unfinished, when its work is done.
     """
     lights, layers, done = len(problem.p), problem.like.shape[1], 0
     pose, expected = new_pair_pose(problem), new_expected(lights)
     tries = np.empty((0, 7))
     thirds = np.empty((_THIRDS if goal.bounds[LEAST] > 3 else _ALL_THIRDS, 3))
     level = unseen[0] if len(unseen) else 0
-    while level >= _wanted(goal, layers) and problem.work[0] <= goal.most_work:
+    while level >= _matter(goal, layers) and problem.work[0] <= goal.most_work:
+        goal.bounds[LEVEL] = level
         while done < len(pairs) and unseen[done] >= level and problem.work[0] <= goal.most_work:
-            least = max(_wanted(goal, layers) - 2, 1)
+            least = max(_matter(goal, layers) - 2, 1)
             both = (pairs[done, 0], pairs[done, 1])
             tries = np.concatenate((tries, pair_poses(both, least, goal.most_work, problem, pose, expected)))
             done += 1
         for o in _most_first(tries, lights):
-            if tries[o, SUPPORT] < max(level, _wanted(goal, layers)) - 2 or problem.work[0] > goal.most_work:
+            if tries[o, SUPPORT] < _wanted(goal, layers) - 2 or problem.work[0] > goal.most_work:
                 break
             count = _try_pair(pair_of(tries[o], lights), problem, pose, expected, thirds, goal, count, hypotheses)
-            tries[o, SUPPORT] = 0.0  # done
         level -= 1
     for k in range(count):
         one = Candidate(hypotheses.assignments[k], hypotheses.R[k], hypotheses.t[k])
@@ -125,10 +126,16 @@ def _most_first(tries: Array, lights: int) -> Indices:
 
 
 @part
-def _wanted(goal: Goal, layers: int) -> int:
+def _matter(goal: Goal, layers: int) -> int:
     """How many lights of one layer a hypothesis must assign to matter."""
-    least, floor, most, in_layer = goal.bounds
-    return max(least, in_layer, (max(most, floor) + layers - 1) // layers)
+    bounds = goal.bounds
+    return max(bounds[LEAST], bounds[IN_LAYER], (max(bounds[MOST], bounds[FLOOR]) + layers - 1) // layers)
+
+
+@part
+def _wanted(goal: Goal, layers: int) -> int:
+    """How many lights of one layer are looked for now."""
+    return max(goal.bounds[LEVEL], _matter(goal, layers))
 
 
 @part
