@@ -45,6 +45,7 @@ _MAX_RELABELLINGS = 4  # each betters the evidence; more than two have not been 
 _OPEN_ROLL_RAD = math.radians(45.0)  # 1 sigma; of a roll less known than this a steady vehicle says nothing
 _ANY_COSINE = 2.0  # of a roll that nothing bounds; so is its negative
 _FEW = 10  # detections, among which four lights at any roll are searched for in a few ms
+_SPARE = 2  # lights of the best that a turned array may do without: they may be clutter that fits by chance
 _AROUND = 0.25  # of the width of the assigned detections: how far around them others crowd
 
 
@@ -143,17 +144,32 @@ def acquire(
 
 
 def _rivals_of_any_roll(task: _Search, found: Hypotheses) -> tuple[Hypotheses, bool]:
-    """Hypotheses of any roll with as many lights as the best found so far; and whether the search came to its end.
+    """Hypotheses of any roll that may stand against the best found so far; and whether the search came to its end.
 
-    Their prior is as small as a light is worth, so that with fewer lights they are out of the question. An array that
-    fits itself when turned keeps its layers: so as many lights of one layer are wanted, too.
+    Their prior is as small as a light is worth: with fewer lights than the best, or of one layer, they are out of the
+    question. Where the best may be an answer, its own detections tell first whether the array fits them turned, too.
     """
     config, best = task.config, float(found.log_evidence.max(initial=_NONE))
-    if best + config.log_dock > config.margin:  # it may be an answer
-        lights, of_a_layer = _counted(found.assignments[0], task.model)
-    else:
-        lights = of_a_layer = CHECKED_LIGHTS + int(len(task.problem.uv) > _FEW)
-    return _search(task, task.problem, max(lights, CHECKED_LIGHTS), max(of_a_layer, CHECKED_LIGHTS), best=best)
+    if best + config.log_dock <= config.margin:
+        least = CHECKED_LIGHTS + int(len(task.problem.uv) > _FEW)
+        return _search(task, task.problem, least, least, best=best)
+    count = task.model.count(found.assignments[0])
+    used = np.sort(found.assignments[0][found.assignments[0] >= 0])
+    least, of_a_layer = (max(n - _SPARE, CHECKED_LIGHTS) for n in (sum(count), max(count)))
+    turned, complete = _search(task, _only(task.problem, used), least, of_a_layer, best=best)
+    if not complete or (turned.log_evidence <= best - config.keep).all():
+        return _cut(turned, np.empty(0, np.int64)), complete
+    turned.assignments[:] = np.where(turned.assignments >= 0, used[turned.assignments], -1)
+    least, of_a_layer = (max(n, CHECKED_LIGHTS) for n in (sum(count), max(count)))
+    more, complete = _search(task, task.problem, least, of_a_layer, best=best)
+    return _merged(more, turned), complete
+
+
+def _only(problem: Problem, used: Indices) -> Problem:
+    """The same problem with some of its detections (K,) alone; the others stay clutter."""
+    uv = problem.uv[used]
+    by_u: Indices = np.argsort(uv[:, 0])
+    return problem._replace(uv=uv, by_u=by_u, ray=problem.ray[used], var=problem.var[used], like=problem.like[used])
 
 
 def _counted(assignment: Indices, model: StationModel) -> tuple[int, int]:
@@ -164,16 +180,28 @@ def _counted(assignment: Indices, model: StationModel) -> tuple[int, int]:
 
 def _merged(a: Hypotheses, b: Hypotheses) -> Hypotheses:
     """Two lists of hypotheses as one, the best first."""
-    together = [np.concatenate(values) for values in zip(a, b, strict=True)]
-    best_first = np.argsort(-together[1], kind="stable")
-    return Hypotheses(*(values[best_first] for values in together))
+    together = Hypotheses(
+        np.concatenate([a.assignments, b.assignments]),
+        np.concatenate([a.log_evidence, b.log_evidence]),
+        np.concatenate([a.R, b.R]),
+        np.concatenate([a.t, b.t]),
+    )
+    best_first: Indices = np.argsort(-together.log_evidence, kind="stable")
+    return _cut(together, best_first)
+
+
+def _cut(found: Hypotheses, which: Indices) -> Hypotheses:
+    """Some hypotheses (K,) of a list."""
+    assignments, scores, R, t = found
+    return Hypotheses(assignments[which], scores[which], R[which], t[which])
 
 
 def _rolled(problem: Problem, prior: AttitudePrior) -> Problem:
     """The same problem for a vehicle of any roll beyond that of the prior, its probability included."""
     beyond = (problem.rules.roll_cosines[1], -_ANY_COSINE)
-    rules = problem.rules._replace(roll_cosines=beyond, steady=0.0, log_prior=math.log(prior.any_roll))
-    return problem._replace(info=prior.rolled().info, rules=rules)
+    rules = problem.rules._replace(roll_cosines=beyond, log_prior=math.log(prior.any_roll))
+    info = prior.rolled().info
+    return problem._replace(info=info, steady=np.array([*problem.steady[:2], info[2]]), rules=rules)
 
 
 def _decided(
@@ -329,9 +357,7 @@ def _search(task: _Search, problem: Problem, floor: int, *leasts: int, best: flo
         if sure or len(task.problem.uv) > task.config.max_detections_three:
             break
     best_first = np.argsort(-found.log_evidence[:count], kind="stable")
-    assignments, scores, R, t = found
-    listed = Hypotheses(assignments[best_first], scores[best_first], R[best_first], t[best_first])
-    return listed, int(problem.work[0]) <= most_work
+    return _cut(found, best_first), int(problem.work[0]) <= most_work
 
 
 def _relabelled(task: _Search, top: Hypothesis) -> tuple[Hypothesis, Doubt]:
