@@ -179,7 +179,8 @@ def _counted(assignment: Indices, model: StationModel) -> tuple[int, int]:
 
 
 def _merged(a: Hypotheses, b: Hypotheses) -> Hypotheses:
-    """Two lists of hypotheses as one, the best first."""
+    """Two lists of hypotheses as one, the best first, without those of the second that are in the first."""
+    b = _cut(b, np.flatnonzero(~(b.assignments[:, None] == a.assignments[None]).all(axis=2).any(axis=1)))
     together = Hypotheses(
         np.concatenate([a.assignments, b.assignments]),
         np.concatenate([a.log_evidence, b.log_evidence]),
