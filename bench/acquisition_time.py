@@ -18,7 +18,7 @@ from lumidock.config import Config
 from lumidock.datatypes import Array, Detections
 from lumidock.model import attitude_prior, measurements, station_model
 
-_SEED, _DRAWS, _RANDOM = 8800, 300, (4, 16, 60, 200)
+_SEED, _DRAWS, _RANDOM = 8800, 100, (4, 16, 60, 200)
 _Z_M = (3.0, 20.0)
 
 

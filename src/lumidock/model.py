@@ -112,13 +112,20 @@ def station_model(station: Station, camera: Camera, config: MatchConfig) -> Stat
         layer=station.layer,
         n_layers=len(station.layers),
         is_rear=((behind == len(front_first) - 1) & (behind > 0)).astype(np.int64),  # a lone layer is the front one
-        group=np.arange(len(station)) % MAX_SUBSETS,
+        group=_groups(station),
         survey_m2=station.sigma_light_m**2 + (behind > 0)[station.layer] * 2.0 * station.sigma_layer_m**2,
         order=_pair_order(station),
         planes=_planes(station),
         log_volume=math.log(float(size.prod()) * config.far_m**3 / 3.0),
         sigma_focal=station.sigma_focal,
     )
+
+
+def _groups(station: Station) -> Indices:
+    """The subset (M,) that is blind to each light: layer by layer, so that two lights of one seldom share it."""
+    group = np.empty(len(station), np.int64)
+    group[np.argsort(station.layer, kind="stable")] = np.arange(len(station)) % MAX_SUBSETS
+    return group
 
 
 def _planes(station: Station) -> Array:
