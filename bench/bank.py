@@ -31,7 +31,7 @@ def approach(station: Station, rng: np.random.Generator) -> Iterator[Detections]
 def tracked_ms(station: Station, *, bank: bool) -> list[float]:
     """Milliseconds of each tracked frame; without its bank a track never begins a subset."""
     localizer, times = Localizer(station, shipped_camera()), []
-    kernel = nullcontext() if bank else patch.object(track.bank_kernel, "update_bank", lambda *_: None)
+    kernel = nullcontext() if bank else patch.object(track.bank_kernel, "update_bank", lambda *_, **__: None)
     with kernel:
         for detections in approach(station, np.random.default_rng(_SEED)):
             start = time.thread_time()

@@ -377,7 +377,7 @@ def _bank_updated(
         turn_cov=after.state.P[3:6, 3:6].copy(),
         proven_m=config.proven_m,
     )
-    bank_kernel.update_bank(model.lights, before.state, after.state, seen, rules, before.bank, bank)
+    bank_kernel.update_bank(model.lights, before.state, after.state, seen, rules, bank=before.bank, updated=bank)
     return replace(after, bank=bank)
 
 

@@ -141,5 +141,5 @@ class Bound:
             turn_cov=np.eye(3),
             proven_m=self.config.track.proven_m,
         )
-        update_bank(self._model.lights, before, before, seen, bank_rules, self._bank, bank)
+        update_bank(self._model.lights, before, before, seen, bank_rules, bank=self._bank, updated=bank)
         self._bank = bank
