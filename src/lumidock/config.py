@@ -249,7 +249,7 @@ class MatchConfig(SettingsGroup):
     detections_per_light: PositiveInt = 2
     # units of work of one frame's acquisition, a pose of two detections or a quarter of a fit, 1.4 us each (bench
     # `acquisition-time`); what is found before all is searched is no answer: `too_many`
-    max_work: Work = 20_000
+    max_work: Work = 18_000
     log_dock: float = 2.0  # log prior odds that the dock is in view at all
     max_detections_three: PositiveInt = 14  # among more detections, three lights of a layer identify nothing
     sure: PositiveFloat = 15.0  # log evidence above which associations of three lights a layer are not searched for
