@@ -297,6 +297,17 @@ class IntegrityConfig(SettingsGroup):
     max_age_s: Age = 0.3  # of the last detected light, up to which a fix is predicted
 
 
+class FilesConfig(SettingsGroup):
+    """What is believed of the station and the camera file; docs/safety-case.md says how smaller sigmas are earned."""
+
+    # least 1 sigma of a layer's rigid offset where the file declares one and the dock has several layers: what welding
+    # and tape leave over some metres; a survey from images declares none
+    layer_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.02
+    # least 1 sigma of a calibration of which the station file states none: ...
+    focal: Annotated[float, Field(ge=0.0, le=0.1)] = 0.01  # ... of the focal length, relative; a board in a pool gives 0.3-1 %
+    center_px: Annotated[float, Field(ge=0.0, le=100.0)] = 4.0  # ... of the principal point
+
+
 class Config(SettingsGroup):
     """All settings; saved with every run."""
 
@@ -305,6 +316,7 @@ class Config(SettingsGroup):
     match: MatchConfig = MatchConfig()
     track: TrackConfig = TrackConfig()
     integrity: IntegrityConfig = IntegrityConfig()
+    files: FilesConfig = FilesConfig()
     detect: DetectConfig = DetectConfig()
     label: LabelConfig = LabelConfig()
     methods: dict[str, dict[str, Any]] = {}  # settings of the methods that installed packages add, by their names

@@ -214,6 +214,18 @@ class Guide:
     pl_range_m: float
 
 
+@dataclass(frozen=True, slots=True)
+class Contradiction:
+    """What the lights say against a file, in one sentence `text`; `file` is the reason of the fix.
+
+    `subject`: the id of the light, the layer, or the parameter of the camera that is off.
+    """
+
+    file: Literal["calibration", "survey"]
+    subject: str
+    text: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
     """A pose `T_dock_cam` (4, 4) that fits where none is proven, with its `probability` among those that fit."""
@@ -231,7 +243,7 @@ class Fix:
     innovation squared of a tracked frame over its degrees of freedom, 1 on average where noise is as stated; NaN
     without history. `n_seen` counts the frame's detections and `n_used` those behind the pose; `by_layer` holds what
     each layer's lights give alone, where a method works by layer. `alternatives`: the poses that fit while none is
-    proven, the likeliest first; never a fix.
+    proven, the likeliest first; never a fix. `contradiction`: what is wrong with which file, where that is the reason.
     """
 
     frame: str
@@ -249,6 +261,7 @@ class Fix:
     guide: Guide | None = None
     nis: float = math.nan
     alternatives: tuple[Alternative, ...] = ()
+    contradiction: Contradiction | None = None
 
     def __post_init__(self) -> None:
         if (self.T_dock_cam is None) != bool(self.reason):

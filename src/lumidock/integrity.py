@@ -12,12 +12,13 @@ import numpy as np
 from lumidock._kernels.tracking.levels import Groups, SigmaFactors, protection_levels
 from lumidock.alert_limits import AlertLimits
 from lumidock.config import IntegrityConfig
-from lumidock.datatypes import Alternative, Array, Detections, Fix, Guide, Match, Protection, Stage, Status
+from lumidock.datatypes import Alternative, Array, Contradiction, Detections, Fix, Guide, Match, Protection, Stage, Status
+from lumidock.file_check import contradiction
 from lumidock.geometry import se3_inverse
 from lumidock.model import StationModel, light_of
 from lumidock.state import Context, LocalizerState
 from lumidock.track import Track
-from lumidock.verify import contradict, contradicted_file, is_proven
+from lumidock.verify import contradict, is_proven
 
 _ANY_BEARING_RAD = math.sqrt(2.0) * math.pi  # at the origin itself a bearing says nothing ...
 _CLEAR, _STEEP_RAD = 2.0, 0.3  # ... which begins so many range levels away, or with such a bearing level
@@ -155,7 +156,8 @@ def assess(
     if status == "coasting" and (reason := _why_no_coasting(first, detections.t_ns, config)):
         return no_fix(state, detections, status, reason), state
     bound = bounds(state.hypotheses, context.model, config)
-    doubt, limits = _doubt(state, context), context.station.alert_limits
+    against = _contradiction(state, context)
+    doubt, limits = _doubt(state, context) or (against.file if against else ""), context.station.alert_limits
     valid, used = not doubt and pose_holds(bound, limits), first.last.n_used
     now = stage(first, context.model) or state.stage
     state = state if now == state.stage else replace(state, stage=now)
@@ -174,8 +176,14 @@ def assess(
         guide=bound.guide if not doubt and guide_holds(bound, limits) else None,
         nis=first.last.nis / (2 * used) if status == "tracking" else math.nan,
         alternatives=alternatives(state.hypotheses) if doubt in _OPEN else (),
+        contradiction=against if against and doubt == against.file else None,
     )
     return fix, state
+
+
+def _contradiction(state: LocalizerState, context: Context) -> Contradiction | None:
+    """What the track's lights, or those of a layer that it cannot explain, say against the files."""
+    return state.contradiction or contradiction(state.first, context.station, context.parameters)
 
 
 def alternatives(tracks: Sequence[Track]) -> tuple[Alternative, ...]:
@@ -188,7 +196,7 @@ def alternatives(tracks: Sequence[Track]) -> tuple[Alternative, ...]:
 
 
 def _doubt(state: LocalizerState, context: Context) -> str:
-    """The word for a track that no level makes valid: another fits too, it is not proven, or the files are wrong."""
+    """The word for a track that no level makes valid: another fits too, or it is not proven."""
     first, config = state.first, context.config.integrity
     if not is_proven(first, state.margin, config):
         rivals = state.hypotheses[1:]
@@ -197,7 +205,7 @@ def _doubt(state: LocalizerState, context: Context) -> str:
         return "ambiguous"
     if state.thin_frames >= config.thin_frames:
         return "unproven"
-    return contradicted_file(first, context.prior_var)[0]
+    return ""
 
 
 def _why_no_coasting(first: Track, t_ns: int, config: IntegrityConfig) -> str:

@@ -123,11 +123,14 @@ def _tracked(
     """A confirmed track holds; where it may overlook a layer, the frame is acquired anew to compare."""
     context = moment.context
     tracked = _checked(replace(state, hypotheses=tuple(followed), failures=0), moment)
+    if sees_two_layers(followed[0].last.count):
+        tracked = replace(tracked, contradiction=None)
     if not tracking.overlooks(followed[0], moment.frame, context):
         return integrity.assess(tracked, detections, "tracking", context)
     found = moment.acquire()
     if not _shows_two_layers(found, context):
-        return integrity.assess(replace(tracked, failures=1), detections, "tracking", context)
+        against = moment.displaced_layer(followed[0]) or tracked.contradiction
+        return integrity.assess(replace(tracked, failures=1, contradiction=against), detections, "tracking", context)
     # what the track has learned while it overlooked a layer is in doubt too; a failure, so that the next search is full
     doubted = replace(state, confirmed=False, calibration=None, failures=1)
     return _acquired(doubted, followed, detections, moment, found, still_held=followed[:1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from lumidock._kernels.measurements import Appearance, Measurements, weigh
 from lumidock._kernels.tracking.track import Lights
 from lumidock.camera import Camera
-from lumidock.config import MatchConfig, PriorConfig
+from lumidock.config import FilesConfig, MatchConfig, PriorConfig
 from lumidock.datatypes import Array, Attitude, Detections, Indices
 from lumidock.light_counts import MAX_SUBSETS
 from lumidock.station import Station
@@ -78,6 +78,20 @@ class AttitudePrior:
     R_dock_cam: Array
     info: Array
     measured: bool
+
+
+def believed(station: Station, config: FilesConfig) -> Station:
+    """The station with the sigmas that the estimator takes: never less than what such files are found to hold."""
+    several = len(station.layers) > 1 and station.sigma_layer_m > 0.0
+    layer_m = max(station.sigma_layer_m, config.layer_m) if several else station.sigma_layer_m
+    if station.calibration_stated:
+        return replace(station, sigma_layer_m=layer_m)
+    return replace(
+        station,
+        sigma_layer_m=layer_m,
+        sigma_focal=max(station.sigma_focal, config.focal),
+        sigma_center_px=max(station.sigma_center_px, config.center_px),
+    )
 
 
 def station_model(station: Station, camera: Camera, config: MatchConfig) -> StationModel:

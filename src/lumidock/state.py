@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from lumidock.camera import Camera
 from lumidock.config import Config
-from lumidock.datatypes import Array, Detections, Stage
-from lumidock.model import StationModel, station_model
+from lumidock.datatypes import Contradiction, Detections, Stage
+from lumidock.file_check import Parameters, parameters
+from lumidock.light_counts import CHECKED_LIGHTS
+from lumidock.model import StationModel, believed, station_model
 from lumidock.station import Station
 from lumidock.track import CalibrationStates, Track, calibration_prior
 
@@ -18,7 +18,8 @@ from lumidock.track import CalibrationStates, Track, calibration_prior
 class Context:
     """What stays the same from frame to frame: the dock, the camera, the settings, and `model`, made of them.
 
-    `prior_var` (n,): what the files say of the variance of each of the filter's calibration states.
+    `parameters`: what may be wrong in the files. `layer_alone`: the model of each layer by itself, where there are
+    several and it has lights enough to be identified so, else None.
     """
 
     station: Station
@@ -26,13 +27,23 @@ class Context:
     config: Config
     model: StationModel
     cold: bool
-    prior_var: Array
+    parameters: Parameters
+    layer_alone: tuple[StationModel | None, ...]
 
     @classmethod
     def of(cls, station: Station, camera: Camera, config: Config, *, cold: bool) -> Context:
         """Everything that is derived from station and camera, made once."""
+        station = believed(station, config.files)
         model, declared = station_model(station, camera, config.match), calibration_prior(station, None)
-        return cls(station, camera, config, model, cold, np.diagonal(declared.P).copy())
+        alone = tuple(
+            station_model(station.only(name), camera, config.match)
+            if len(station.lights_of(name)) >= CHECKED_LIGHTS and len(station.layers) > 1
+            else None
+            for name in station.layers
+        )
+        return cls(
+            station, camera, config, model, cold, parameters=parameters(station, declared), layer_alone=alone
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +55,8 @@ class LocalizerState:
     `thin_frames`: frames in a row, up to the last that was checked, in which fewer than four lights held the track.
     `twin`: another array of the same layout was in view. `frozen`: the last frame was the picture before it again.
     `failures`: frames since the first hypothesis last held. `stage`: docking stage of the last fix. `last`: detections
-    of the frame before. `calibration`: what an earlier track has learned of survey and calibration.
+    of the frame before. `calibration`: what an earlier track has learned of survey and calibration. `contradiction`:
+    a layer in view contradicts the files, and no frame since has shown two layers that fit together.
     """
 
     hypotheses: tuple[Track, ...] = ()
@@ -57,6 +69,7 @@ class LocalizerState:
     stage: Stage = "search"
     last: Detections | None = None
     calibration: CalibrationStates | None = None
+    contradiction: Contradiction | None = None
 
     @property
     def first(self) -> Track:
