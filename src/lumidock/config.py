@@ -303,9 +303,10 @@ class FilesConfig(SettingsGroup):
     # least 1 sigma of a layer's rigid offset where the file declares one and the dock has several layers: what welding
     # and tape leave over some metres; a survey from images declares none
     layer_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.02
-    # least 1 sigma of a calibration of which the station file states none: ...
-    focal: Annotated[float, Field(ge=0.0, le=0.1)] = 0.01  # ... of the focal length, relative; a board in a pool gives 0.3-1 %
-    center_px: Annotated[float, Field(ge=0.0, le=100.0)] = 4.0  # ... of the principal point
+    # least 1 sigma of a calibration of which the station file states none: of the focal length, relative: a board gives
+    # 0.5-1 %, and the refractive index of water lies between 1.333, fresh and warm, and 1.344, salt and cold; ...
+    focal: Annotated[float, Field(ge=0.0, le=0.1)] = 0.015
+    center_px: Annotated[float, Field(ge=0.0, le=100.0)] = 3.0  # ... and of the principal point
 
 
 class Config(SettingsGroup):

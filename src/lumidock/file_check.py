@@ -7,81 +7,128 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lumidock._kernels.tracking.track import CALIBRATION, LIGHTS
-from lumidock.datatypes import Array, Contradiction
+from lumidock._kernels.measurements import Measurements
+from lumidock._kernels.tracking.track import CALIBRATION, LIGHTS, PredictedMeasurements
+from lumidock.camera import Camera
+from lumidock.datatypes import Array, Contradiction, Indices
 from lumidock.geometry import se3_inverse
+from lumidock.light_counts import CHECKED_LIGHTS
 from lumidock.station import Station
 from lumidock.track import CalibrationStates, Track
 
-_TOLD_SHARE = 0.02  # least share of a prior variance that measurements removed; below, linearisation errors dominate
-_SURE_SHARE = 0.1  # least such share of an axis along which a shift is stated
+_TOLD_SHARE = 0.02  # least share of what perfect images would tell, that they told; below, linearisation errors dominate
+_SURE_SHARE = 0.1  # of the best known direction of a shift, that another needs to be stated too
 _CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
-_STATES = LIGHTS - CALIBRATION  # of the lens: focal length, principal point u and v
+_LENS = LIGHTS - CALIBRATION  # states of the lens: focal length, principal point u and v
 
 
 class Parameters(NamedTuple):
-    """What may be wrong in the files, K parameters as sums of the n filter states from `CALIBRATION` on.
+    """What may be wrong in the files: K single errors, over the n filter states from `CALIBRATION` on.
 
-    `sums` (K, n - 15): the lens's three, each light along three axes, and where there are several layers the mean shift
-    of each along three axes. `prior_var` (K,): their variances by the files.
+    The lens's three states, each light along three axes, and, where there are several layers, each along three axes.
+    `weights` (K, n): an error's direction times the inverse of the covariance that the files declare. `declared`
+    (n, n): this covariance. `most` (K,): the information on each that perfect images would give.
     """
 
-    sums: Array
-    prior_var: Array
+    weights: Array
+    declared: Array
+    most: Array
 
 
 def parameters(station: Station, declared: CalibrationStates) -> Parameters:
     """The parameters of a station whose files declare so much."""
     P, m = declared.P[CALIBRATION:, CALIBRATION:], len(station)
-    sums = [np.eye(len(P))]
+    errors = [np.eye(len(P))]
     if len(station.layers) > 1:
-        for name in station.layers:
-            lights = station.lights_of(name)
-            mean = np.zeros((3, m, 3))
-            mean[[0, 1, 2], :, [0, 1, 2]] = (np.bincount(lights, minlength=m) > 0) / len(lights)
-            sums.append(np.concatenate([np.zeros((3, _STATES)), mean.reshape(3, -1)], axis=1))
-    together = np.concatenate(sums)
-    return Parameters(together, np.asarray(((together @ P) * together).sum(axis=1)))
+        for k in range(len(station.layers)):
+            shifted = np.kron((station.layer == k).astype(float), np.eye(3))
+            errors.append(np.concatenate([np.zeros((3, _LENS)), shifted], axis=1))
+    directions = np.concatenate(errors)
+    weights = directions @ np.linalg.pinv(P, hermitian=True)  # what is declared exact is not tested
+    return Parameters(weights, P, np.asarray((weights * directions).sum(axis=1)))
 
 
-def contradiction(track: Track, station: Station, parameters: Parameters) -> Contradiction | None:
-    """What explains best that the lights do not fit the files, where they contradict them.
+class DistortionTest(NamedTuple):
+    """What the innovations of a track say of a radial distortion k1 that the calibration leaves out.
 
-    Of each parameter the square over the variance that the lights have taken out of its prior is by how much the sum of
-    squares falls if the files know nothing of it: chi-square of one degree of freedom while they hold (a score test).
+    `score` and `information` of all frames: score^2 / information is chi-square of one degree of freedom while it leaves
+    out nothing, since innovations are white then.
+    """
+
+    score: float = 0.0
+    information: float = 0.0
+
+    def with_frame(
+        self, predicted: PredictedMeasurements, assignment: Indices, frame: Measurements, camera: Camera
+    ) -> DistortionTest:
+        """With the innovation of one more frame, of the detections in an `assignment` (M,)."""
+        lights = np.flatnonzero((assignment >= 0) & np.isfinite(predicted.uv[:, 0]))
+        if len(lights) < CHECKED_LIGHTS:
+            return self
+        off = predicted.uv[lights] - camera.center_px
+        signature = (off * ((off / camera.focal_px) ** 2).sum(axis=1, keepdims=True)).ravel()
+        pixels = (2 * lights[:, None] + [0, 1]).ravel()
+        S = predicted.S[np.ix_(pixels, pixels)]
+        for k, detection in enumerate(assignment[lights]):
+            S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += frame.cov[detection]
+        weighed = np.linalg.solve(S, signature)
+        innovation = (frame.uv[assignment[lights]] - predicted.uv[lights]).ravel()
+        return DistortionTest(self.score + float(weighed @ innovation), self.information + float(weighed @ signature))
+
+    @property
+    def chi_square(self) -> float:
+        """The test's value."""
+        return self.score**2 / self.information if self.information else 0.0
+
+    def in_words(self) -> Contradiction:
+        """What is left out; the score tells its sign, but not its size, of which the filter has learned a part."""
+        kind = "barrel" if self.score < 0.0 else "pincushion"
+        return Contradiction("calibration", "distortion", f"lens shows {kind} distortion that the calibration leaves out")
+
+
+def contradiction(
+    track: Track, station: Station, parameters: Parameters, distortion: DistortionTest
+) -> Contradiction | None:
+    """The single error that explains best why the lights do not fit the files, where they contradict them.
+
+    A score test: by how much the sum of squares falls if an error of any size is allowed beside what the files
+    declare. With their covariance P0 and what the track has, x and P, the score of an error along e is e' P0^-1 x and
+    its information e' P0^-1 (P0 - P) P0^-1 e; their quotient score^2 / information is chi-square of one degree of
+    freedom while the files hold.
     """
     if not track.estimates_calibration:
         return None
     x, P = track.state.x[CALIBRATION:], track.state.P[CALIBRATION:, CALIBRATION:]
-    sums, prior, n = parameters.sums, parameters.prior_var, len(x)
-    value = np.concatenate([x, sums[n:] @ x])
-    told = prior - np.concatenate([np.diagonal(P), ((sums[n:] @ P) * sums[n:]).sum(axis=1)])
-    known = told > _TOLD_SHARE * prior
-    test = np.where(known, value**2 / np.maximum(told, 1e-300), 0.0)
+    weights = parameters.weights
+    score, spread = weights @ x, weights @ (parameters.declared - P)
+    information = (spread * weights).sum(axis=1)
+    known = information > _TOLD_SHARE * parameters.most
+    test = np.where(known, score**2 / np.maximum(information, 1e-300), 0.0)
     worst = int(test.argmax())
-    if test[worst] < _CONTRADICTION:
+    if not max(test[worst], distortion.chi_square) > _CONTRADICTION:
         return None
-    # what the lights alone say, without the pull of the prior toward the file
-    alone = np.where(known, value * prior / np.maximum(told, 1e-300), 0.0)
-    return _in_words(worst, np.where(told > _SURE_SHARE * prior, alone, 0.0), alone, station)
-
-
-def _in_words(worst: int, sure: Array, alone: Array, station: Station) -> Contradiction:
-    """The contradiction of the parameter `worst`; the values (K,) of all that are `sure`, and of all."""
+    if distortion.chi_square > test[worst]:
+        return distortion.in_words()
     if worst == 0:
-        return focal_length(float(alone[0]))
-    if worst < _STATES:
-        away = math.hypot(*alone[1:_STATES])
+        return focal_length(float(score[0] / information[0]))
+    first = 1 if worst < _LENS else worst - (worst - _LENS) % 3
+    group = np.arange(first, _LENS if worst < _LENS else first + 3)
+    away = _size(score[group], spread[group] @ weights[group].T)
+    if worst < _LENS:
         text = f"principal point appears {away:.0f} px from where the calibration has it"
         return Contradiction("calibration", "principal point", text)
-    light, axis = divmod(worst - _STATES, 3)
-    first = worst - axis
-    shift = np.where(np.arange(3) == axis, alone[first : first + 3], sure[first : first + 3])
-    away = float(np.linalg.norm(shift))
-    if light < len(station):
-        name = station.ids[light]
-        return Contradiction("survey", name, f"light {name} appears {_length(away)} from its surveyed position")
-    return layer_shifted(station.layers[light - len(station)], away)
+    light = (first - _LENS) // 3
+    if light >= len(station):
+        return layer_shifted(station.layers[light - len(station)], away)
+    name = station.ids[light]
+    return Contradiction("survey", name, f"light {name} appears {_length(away)} from its surveyed position")
+
+
+def _size(score: Array, information: Array) -> float:
+    """Length of the shift of this score (k,) and information (k, k), along the directions in which it is known."""
+    known, directions = np.linalg.eigh(information)
+    sure = known > _SURE_SHARE * known[-1]
+    return float(np.linalg.norm((directions[:, sure].T @ score) / known[sure]))
 
 
 def focal_length(off: float) -> Contradiction:
@@ -93,12 +140,12 @@ def focal_length(off: float) -> Contradiction:
 
 def layer_shifted(layer: str, away_m: float) -> Contradiction:
     """A layer is so far from where it should be, seen from the others."""
-    text = f"layer {layer} appears {_length(away_m)} from its surveyed position against the other lights"
+    text = f"layer {layer} appears {_length(away_m)} from where the survey puts it against the other lights"
     return Contradiction("survey", layer, text)
 
 
 def _length(metres: float) -> str:
-    return f"{100.0 * metres:.0f} cm" if metres >= 0.0095 else f"{1000.0 * metres:.0f} mm"
+    return f"{metres:.1f} m" if metres >= 0.95 else f"{100.0 * metres:.0f} cm"
 
 
 def displaced_layer(track: Track, station: Station, layer: int, T_cam_dock: Array) -> Contradiction:

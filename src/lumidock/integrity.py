@@ -183,7 +183,9 @@ def assess(
 
 def _contradiction(state: LocalizerState, context: Context) -> Contradiction | None:
     """What the track's lights, or those of a layer that it cannot explain, say against the files."""
-    return state.contradiction or contradiction(state.first, context.station, context.parameters)
+    return state.contradiction or contradiction(
+        state.first, context.station, context.parameters, state.distortion
+    )
 
 
 def alternatives(tracks: Sequence[Track]) -> tuple[Alternative, ...]:

@@ -89,8 +89,21 @@ def step(
     followed = tracking.follow(predicted, frame, context, confirmed=state.confirmed)
     moment = Moment(detections.t_ns, frame, detections.attitude, context)
     if state.confirmed and followed and verify.holds(followed[0], count_lamps(frame), context.config.track):
-        return _tracked(state, followed, detections, moment)
+        return _tracked(_told_of_distortion(state, predicted, followed, moment), followed, detections, moment)
     return _lost(replace(state, failures=state.failures + 1), followed, detections, moment)
+
+
+def _told_of_distortion(
+    state: LocalizerState, predicted: Prediction, followed: Sequence[Track], moment: Moment
+) -> LocalizerState:
+    """The state with the frame's innovation weighed against a distortion that the calibration leaves out."""
+    expected, one = predicted.measurements, followed[0]
+    if expected is None or not predicted.tracks[0].estimates_calibration or len(followed) > 1:
+        return state
+    return replace(
+        state,
+        distortion=state.distortion.with_frame(expected, one.last.assignment, moment.frame, moment.context.camera),
+    )
 
 
 def _why_refused(last: Detections | None, detections: Detections) -> str:
