@@ -16,7 +16,9 @@ from lumidock.light_counts import CHECKED_LIGHTS
 from lumidock.station import Station
 from lumidock.track import CalibrationStates, Track
 
-_TOLD_SHARE = 0.02  # least share of what perfect images would tell, that they told; below, linearisation errors dominate
+_TOLD_SHARE = (
+    0.02  # least share of what perfect images would tell, that they told; below, linearisation errors dominate
+)
 _SURE_SHARE = 0.1  # of the best known direction of a shift, that another needs to be stated too
 _CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 _LENS = LIGHTS - CALIBRATION  # states of the lens: focal length, principal point u and v
@@ -67,12 +69,11 @@ class DistortionTest(NamedTuple):
             return self
         off = predicted.uv[lights] - camera.center_px
         signature = (off * ((off / camera.focal_px) ** 2).sum(axis=1, keepdims=True)).ravel()
-        pixels = (2 * lights[:, None] + [0, 1]).ravel()
-        S = predicted.S[np.ix_(pixels, pixels)]
-        for k, detection in enumerate(assignment[lights]):
-            S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += frame.cov[detection]
-        weighed = np.linalg.solve(S, signature)
-        innovation = (frame.uv[assignment[lights]] - predicted.uv[lights]).ravel()
+        n, m, detections = len(lights), len(assignment), assignment[lights]
+        blocks = predicted.S.reshape(m, 2, m, 2)[lights][:, :, lights]  # (n, 2, n, 2)
+        blocks[np.arange(n), :, np.arange(n)] += frame.cov[detections]
+        weighed = np.linalg.solve(blocks.reshape(2 * n, 2 * n), signature)
+        innovation = (frame.uv[detections] - predicted.uv[lights]).ravel()
         return DistortionTest(self.score + float(weighed @ innovation), self.information + float(weighed @ signature))
 
     @property
@@ -83,7 +84,9 @@ class DistortionTest(NamedTuple):
     def in_words(self) -> Contradiction:
         """What is left out; the score tells its sign, but not its size, of which the filter has learned a part."""
         kind = "barrel" if self.score < 0.0 else "pincushion"
-        return Contradiction("calibration", "distortion", f"lens shows {kind} distortion that the calibration leaves out")
+        return Contradiction(
+            "calibration", "distortion", f"lens shows {kind} distortion that the calibration leaves out"
+        )
 
 
 def contradiction(

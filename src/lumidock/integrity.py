@@ -12,7 +12,18 @@ import numpy as np
 from lumidock._kernels.tracking.levels import Groups, SigmaFactors, protection_levels
 from lumidock.alert_limits import AlertLimits
 from lumidock.config import IntegrityConfig
-from lumidock.datatypes import Alternative, Array, Contradiction, Detections, Fix, Guide, Match, Protection, Stage, Status
+from lumidock.datatypes import (
+    Alternative,
+    Array,
+    Contradiction,
+    Detections,
+    Fix,
+    Guide,
+    Match,
+    Protection,
+    Stage,
+    Status,
+)
 from lumidock.file_check import contradiction
 from lumidock.geometry import se3_inverse
 from lumidock.model import StationModel, light_of
@@ -183,9 +194,7 @@ def assess(
 
 def _contradiction(state: LocalizerState, context: Context) -> Contradiction | None:
     """What the track's lights, or those of a layer that it cannot explain, say against the files."""
-    return state.contradiction or contradiction(
-        state.first, context.station, context.parameters, state.distortion
-    )
+    return state.contradiction or contradiction(state.first, context.station, context.parameters, state.distortion)
 
 
 def alternatives(tracks: Sequence[Track]) -> tuple[Alternative, ...]:

@@ -41,9 +41,7 @@ class Context:
             else None
             for name in station.layers
         )
-        return cls(
-            station, camera, config, model, cold, parameters=parameters(station, declared), layer_alone=alone
-        )
+        return cls(station, camera, config, model, cold, parameters=parameters(station, declared), layer_alone=alone)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -182,7 +182,7 @@ def _run(
     as_json: AsJson = False,
 ) -> None:
     """Find the camera's pose in every frame of SOURCE."""
-    from lumidock.app.run import Setup
+    from lumidock.app.run import Setup, contradictions_in_words
     from lumidock.app.run import run as run_source
     from lumidock.streams.run_folder import RunFolder
 
@@ -222,6 +222,7 @@ def _run(
 
         summary = run_source(opened, localizer, folder, setup, on_fix=on_fix, size=(lens.width, lens.height))
     _print_counts(summary.as_dict(), out, as_json)
+    tell(contradictions_in_words(summary.as_dict()))
 
 
 def _require_another_folder(out: Path, source: Path) -> None:

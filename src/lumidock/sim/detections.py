@@ -161,9 +161,7 @@ def _drawn(scenario: Scenario, station: Station, camera: Camera, seed: int) -> _
         drawn = replace(drawn, dead=dead_lamps(faults, rear, drawn.dead, rng))
         lamps = lamp_faults(knobs, rear, p_dock, course, rng)
         lens = lens_faults(faults, course.t_ns * 1e-9, rng)
-    fixed = glints(
-        knobs, p_dock, course, drawn.dead, rear, rng=np.random.default_rng([seed, Draw.STRUCTURE_GLINTS])
-    )
+    fixed = glints(knobs, p_dock, course, drawn.dead, rear, rng=np.random.default_rng([seed, Draw.STRUCTURE_GLINTS]))
     return _Runs(
         scenario,
         station,
@@ -229,7 +227,7 @@ def _delivered(
             d = held.detections
             uv = d.uv + rng.normal(size=d.uv.shape) * faults.frozen_px
             again = replace(d, frame=frame.detections.frame, t_ns=frame.detections.t_ns, uv=uv)
-            frame = replace(frame, detections=again, light=held.light)  # noqa: PLW2901
+            frame = replace(frame, detections=again, light=held.light)
         if comes:
             yield frame
 

@@ -5,7 +5,7 @@ Shapes: N frames, G runs, M lights, K further points that shine. Faults of `Poin
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -37,7 +37,9 @@ class Extras:
     @classmethod
     def together(cls, parts: list[Extras]) -> Extras:
         """All points of several."""
-        return cls(*(np.concatenate([getattr(one, name) for one in parts], axis=1) for name in ("p_dock", "on", "rear")))
+        return cls(
+            *(np.concatenate([getattr(one, name) for one in parts], axis=1) for name in ("p_dock", "on", "rear"))
+        )
 
 
 class LampFaults(NamedTuple):
