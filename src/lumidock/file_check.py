@@ -39,7 +39,7 @@ class Parameters(NamedTuple):
 
 def parameters(station: Station, declared: CalibrationStates) -> Parameters:
     """The parameters of a station whose files declare so much."""
-    P, m = declared.P[CALIBRATION:, CALIBRATION:], len(station)
+    P = declared.P[CALIBRATION:, CALIBRATION:]
     errors = [np.eye(len(P))]
     if len(station.layers) > 1:
         for k in range(len(station.layers)):
@@ -53,8 +53,8 @@ def parameters(station: Station, declared: CalibrationStates) -> Parameters:
 class DistortionTest(NamedTuple):
     """What the innovations of a track say of a radial distortion k1 that the calibration leaves out.
 
-    `score` and `information` of all frames: score^2 / information is chi-square of one degree of freedom while it leaves
-    out nothing, since innovations are white then.
+    `score` and `information` of all frames: score^2 / information is chi-square of one degree of freedom while nothing
+    is left out, since innovations are white then.
     """
 
     score: float = 0.0
@@ -132,6 +132,9 @@ def _size(score: Array, information: Array) -> float:
     known, directions = np.linalg.eigh(information)
     sure = known > _SURE_SHARE * known[-1]
     return float(np.linalg.norm((directions[:, sure].T @ score) / known[sure]))
+
+
+NOTHING_TOLD = DistortionTest()
 
 
 def focal_length(off: float) -> Contradiction:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Contradiction, Detections, Stage
-from lumidock.file_check import DistortionTest, Parameters, parameters
+from lumidock.file_check import NOTHING_TOLD, DistortionTest, Parameters, parameters
 from lumidock.light_counts import CHECKED_LIGHTS
 from lumidock.model import StationModel, believed, station_model
 from lumidock.station import Station
@@ -68,7 +68,7 @@ class LocalizerState:
     last: Detections | None = None
     calibration: CalibrationStates | None = None
     contradiction: Contradiction | None = None
-    distortion: DistortionTest = DistortionTest()
+    distortion: DistortionTest = NOTHING_TOLD
 
     @property
     def first(self) -> Track:

@@ -141,10 +141,9 @@ def _available(row: dict[str, Any]) -> str:
 def _says(row: dict[str, Any]) -> str:
     """The commonest reasons for frames without a valid pose, with their shares of all frames, %."""
     counts, prefix = row["counts"], "reason "
-    reasons = sorted(
-        ((n, key.removeprefix(prefix)) for key, n in counts.items() if key.startswith(prefix)), reverse=True
-    )
-    return ", ".join(f"{word} {100.0 * n / counts['frames']:.0f}" for n, word in reasons[:_MOST_REASONS])
+    reasons = {key.removeprefix(prefix): n for key, n in counts.items() if key.startswith(prefix)}
+    common = sorted(reasons, key=lambda word: -reasons[word])[:_MOST_REASONS]
+    return ", ".join(f"{word} {100.0 * reasons[word] / counts['frames']:.0f}" for word in common)
 
 
 def _told(row: dict[str, Any]) -> str:

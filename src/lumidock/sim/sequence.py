@@ -83,7 +83,7 @@ def render_frame(
 
 
 def require_possible(scenario: Scenario, *, detections: bool = False, video: bool = False) -> None:
-    """Raises: InputError where a scenario cannot be made as bare detections, or as pictures, or a video not hold them."""
+    """Raises: InputError where a scenario cannot be made as bare detections, or as pictures, or as a video."""
     if detections and scenario.lens.port is not None:
         raise InputError(f"{scenario.name}: has a flat port, which bare detections do not model; render it")
     if not detections and scenario.detections.faults.any:
