@@ -14,13 +14,14 @@ from lumidock.datatypes import Array, Contradiction, Indices
 from lumidock.geometry import se3_inverse
 from lumidock.light_counts import CHECKED_LIGHTS
 from lumidock.station import Station
-from lumidock.track import CalibrationStates, Track
+from lumidock.track import Track, calibration_prior
 
 _TOLD_SHARE = (
     0.02  # least share of what perfect images would tell, that they told; below, linearisation errors dominate
 )
 _SURE_SHARE = 0.1  # of the best known direction of a shift, that another needs to be stated too
 _CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
+_CONTRADICTION_OF_WIDER = 10.8  # the same, 1e-3, of what is taken to be wider than declared: no honest file comes near
 _LENS = LIGHTS - CALIBRATION  # states of the lens: focal length, principal point u and v
 
 
@@ -29,17 +30,19 @@ class Parameters(NamedTuple):
 
     The lens's three states, each light along three axes, and, where there are several layers, each along three axes.
     `weights` (K, n): an error's direction times the inverse of the covariance that the files declare. `declared`
-    (n, n): this covariance. `most` (K,): the information on each that perfect images would give.
+    (n, n): this covariance. `most` (K,): the information on each that perfect images would give. `limit` (K,): of the
+    test.
     """
 
     weights: Array
     declared: Array
     most: Array
+    limit: Array
 
 
-def parameters(station: Station, declared: CalibrationStates) -> Parameters:
-    """The parameters of a station whose files declare so much."""
-    P = declared.P[CALIBRATION:, CALIBRATION:]
+def parameters(station: Station, taken: Station) -> Parameters:
+    """The parameters of a station; `taken` is the same with the sigmas that the filter takes in place of the file's."""
+    P = calibration_prior(taken, None).P[CALIBRATION:, CALIBRATION:]
     errors = [np.eye(len(P))]
     if len(station.layers) > 1:
         for k in range(len(station.layers)):
@@ -47,7 +50,12 @@ def parameters(station: Station, declared: CalibrationStates) -> Parameters:
             errors.append(np.concatenate([np.zeros((3, _LENS)), shifted], axis=1))
     directions = np.concatenate(errors)
     weights = directions @ np.linalg.pinv(P, hermitian=True)  # what is declared exact is not tested
-    return Parameters(weights, P, np.asarray((weights * directions).sum(axis=1)))
+    limit = np.full(len(directions), _CONTRADICTION)
+    if taken.sigma_focal > station.sigma_focal:
+        limit[0] = _CONTRADICTION_OF_WIDER
+    if taken.sigma_layer_m > station.sigma_layer_m:
+        limit[len(P) :] = _CONTRADICTION_OF_WIDER
+    return Parameters(weights, P, np.asarray((weights * directions).sum(axis=1)), limit)
 
 
 class DistortionTest(NamedTuple):
@@ -107,10 +115,11 @@ def contradiction(
     information = (spread * weights).sum(axis=1)
     known = information > _TOLD_SHARE * parameters.most
     test = np.where(known, score**2 / np.maximum(information, 1e-300), 0.0)
-    worst = int(test.argmax())
-    if not max(test[worst], distortion.chi_square) > _CONTRADICTION:
+    excess = test / parameters.limit
+    worst, of_distortion = int(excess.argmax()), distortion.chi_square / _CONTRADICTION
+    if not max(excess[worst], of_distortion) > 1.0:
         return None
-    if distortion.chi_square > test[worst]:
+    if of_distortion > excess[worst]:
         return distortion.in_words()
     if worst == 0:
         return focal_length(float(score[0] / information[0]))

@@ -15,6 +15,7 @@ from lumidock.acquisition import Moment
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Fix, Frame
+from lumidock.digest import Digest
 from lumidock.errors import FrameError, InputError
 from lumidock.light_counts import CHECKED_LIGHTS, MAX_DETECTIONS, MAX_LIGHTS, POSE_LIGHTS
 from lumidock.match import Acquisition
@@ -52,6 +53,8 @@ class Localizer:
             raise FrameError("bad_frame", f"frame {frame.name} is {width}x{height}, the calibration {wanted}")
         if self.cold:
             self.forget()
+        digest = self.state.digest
+        self.state = replace(self.state, digest=digest.next(frame.image) if digest else Digest.of(frame.image))
         if self.scan is None or not self.scan.fits(frame):
             self.scan = detect.Scan(frame, self.config.detect, self.camera.focal_px[0] / self.camera.focal_px[1])
         predicted = tracking.predict(self.state, frame.t_ns, self.context)
@@ -62,6 +65,7 @@ class Localizer:
         """The fix of one frame's detections, by a detector of one's own."""
         if self.cold:
             self.forget()
+        self.state = replace(self.state, digest=None)
         return self._step(detections, tracking.predict(self.state, detections.t_ns, self.context))
 
     def search_windows(self, frame: Frame) -> Array | None:

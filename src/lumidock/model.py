@@ -81,17 +81,14 @@ class AttitudePrior:
 
 
 def believed(station: Station, config: FilesConfig) -> Station:
-    """The station with the sigmas that the estimator takes: never less than what such files are found to hold."""
+    """The station with the sigmas that the filter takes: never less than what such files are found to hold.
+
+    Acquisition keeps the declared ones: it takes a layer's offset as one of each light alone, and would lose evidence.
+    """
     several = len(station.layers) > 1 and station.sigma_layer_m > 0.0
     layer_m = max(station.sigma_layer_m, config.layer_m) if several else station.sigma_layer_m
-    if station.calibration_stated:
-        return replace(station, sigma_layer_m=layer_m)
-    return replace(
-        station,
-        sigma_layer_m=layer_m,
-        sigma_focal=max(station.sigma_focal, config.focal),
-        sigma_center_px=max(station.sigma_center_px, config.center_px),
-    )
+    focal = station.sigma_focal if station.calibration_stated else max(station.sigma_focal, config.focal)
+    return replace(station, sigma_layer_m=layer_m, sigma_focal=focal)
 
 
 def station_model(station: Station, camera: Camera, config: MatchConfig) -> StationModel:

@@ -7,17 +7,19 @@ from dataclasses import dataclass
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Contradiction, Detections, Stage
+from lumidock.digest import Digest
 from lumidock.file_check import NOTHING_TOLD, DistortionTest, Parameters, parameters
 from lumidock.light_counts import CHECKED_LIGHTS
 from lumidock.model import StationModel, believed, station_model
 from lumidock.station import Station
-from lumidock.track import CalibrationStates, Track, calibration_prior
+from lumidock.track import CalibrationStates, Track
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Context:
     """What stays the same from frame to frame: the dock, the camera, the settings, and `model`, made of them.
 
+    `station` has the sigmas that the filter takes, `model` those that the file declares.
     `parameters`: what may be wrong in the files. `layer_alone`: the model of each layer by itself, where there are
     several and it has lights enough to be identified so, else None.
     """
@@ -33,15 +35,22 @@ class Context:
     @classmethod
     def of(cls, station: Station, camera: Camera, config: Config, *, cold: bool) -> Context:
         """Everything that is derived from station and camera, made once."""
-        station = believed(station, config.files)
-        model, declared = station_model(station, camera, config.match), calibration_prior(station, None)
         alone = tuple(
             station_model(station.only(name), camera, config.match)
             if len(station.lights_of(name)) >= CHECKED_LIGHTS and len(station.layers) > 1
             else None
             for name in station.layers
         )
-        return cls(station, camera, config, model, cold, parameters=parameters(station, declared), layer_alone=alone)
+        taken = believed(station, config.files)
+        return cls(
+            taken,
+            camera,
+            config,
+            station_model(station, camera, config.match),
+            cold,
+            parameters=parameters(station, taken),
+            layer_alone=alone,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +63,8 @@ class LocalizerState:
     `twin`: another array of the same layout was in view. `frozen`: the last frame was the picture before it again.
     `failures`: frames since the first hypothesis last held. `stage`: docking stage of the last fix. `last`: detections
     of the frame before. `calibration`: what an earlier track has learned of survey and calibration. `contradiction`:
-    a layer in view contradicts the files, and no frame since has shown two layers that fit together.
+    a layer in view contradicts the files, and no frame since has shown two layers that fit together. `distortion`: what
+    all innovations say of it. `digest`: of the frame's picture, where there is one.
     """
 
     hypotheses: tuple[Track, ...] = ()
@@ -69,6 +79,7 @@ class LocalizerState:
     calibration: CalibrationStates | None = None
     contradiction: Contradiction | None = None
     distortion: DistortionTest = NOTHING_TOLD
+    digest: Digest | None = None
 
     @property
     def first(self) -> Track:

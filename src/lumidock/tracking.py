@@ -12,7 +12,7 @@ from lumidock import track, verify
 from lumidock._kernels.measurements import Measurements
 from lumidock._kernels.tracking.track import PredictedMeasurements
 from lumidock.datatypes import Array, Attitude
-from lumidock.light_counts import CHECKED_LIGHTS
+from lumidock.light_counts import CHECKED_LIGHTS, POSE_LIGHTS
 from lumidock.model import count_lamps
 from lumidock.state import Context, LocalizerState
 from lumidock.track import FrameResult, Track
@@ -61,8 +61,8 @@ def _is_tracked(state: LocalizerState, t_ns: int) -> bool:
 
 def is_frozen(state: LocalizerState, predicted: Prediction, frame: Measurements, context: Context) -> bool:
     """Whether the frame is the picture before again, though the confirmed track moves or that one was frozen too."""
-    before = state.last
-    if before is None or not verify.repeats(frame, before.uv):
+    before, same_picture = state.last, state.digest is not None and state.digest.repeats
+    if before is None or not verify.repeats(frame, before.uv, least=1 if same_picture else POSE_LIGHTS):
         return False
     if state.frozen:
         return True

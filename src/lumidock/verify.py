@@ -58,12 +58,12 @@ def agrees(found: Acquisition, assignment: Indices, config: MatchConfig) -> bool
     return same >= CHECKED_LIGHTS and not contradict(fresh, assignment)
 
 
-def repeats(frame: Measurements, before: Array) -> bool:
-    """Whether a picture is the one `before` again, of centroids (N, 2) px.
+def repeats(frame: Measurements, before: Array, *, least: int) -> bool:
+    """Whether a picture is the one `before` again, of centroids (N, 2) px, by so many of them at `least`.
 
     Noise never repeats: most centroids within a fraction of their sigma come from a camera or decoder that hangs.
     """
-    least = max(POSE_LIGHTS, math.ceil(_REPEATED_SHARE * len(frame.uv)))
+    least = max(least, math.ceil(_REPEATED_SHARE * len(frame.uv)))
     if len(before) == 0 or len(frame.uv) < least:
         return False
     apart = np.linalg.norm(frame.uv[:, None] - before[None], axis=2).min(axis=1) / np.sqrt(frame.var)

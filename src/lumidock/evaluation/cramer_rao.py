@@ -35,10 +35,9 @@ class Bound:
 
     def __init__(self, station: Station, camera: Camera, config: Config, *, cold: bool = False) -> None:
         self.station, self.camera, self.config, self.cold = station, camera, config, cold
-        station = believed(station, config.files)
         self._model = station_model(station, camera, config.match)
         self._prior = attitude_prior(None, config.prior)
-        self._declared = track.calibration_prior(station, None)
+        self._declared = track.calibration_prior(believed(station, config.files), None)
         self._no_planes = np.full_like(self._model.planes, np.nan)  # the true tilt is known
         self.forget()
 
