@@ -22,6 +22,9 @@ _TOLD_SHARE = (
 _SURE_SHARE = 0.1  # of the best known direction of a shift, that another needs to be stated too
 _CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 _CONTRADICTION_OF_WIDER = 10.8  # the same, 1e-3, of what is taken to be wider than declared: no honest file comes near
+# of the best explanation; a wrong focal length and a layer that lies deeper explain the same, and a few per cent of a
+# focal length are likelier than some 20 cm of a dock
+_LENS_FIRST = 0.7
 _LENS = LIGHTS - CALIBRATION  # states of the lens: focal length, principal point u and v
 
 
@@ -121,7 +124,7 @@ def contradiction(
         return None
     if of_distortion > excess[worst]:
         return distortion.in_words()
-    if worst == 0:
+    if worst == 0 or excess[0] > _LENS_FIRST * excess[worst]:
         return focal_length(float(score[0] / information[0]))
     first = 1 if worst < _LENS else worst - (worst - _LENS) % 3
     group = np.arange(first, _LENS if worst < _LENS else first + 3)
