@@ -181,16 +181,19 @@ def _lost(
 ) -> tuple[Fix, LocalizerState]:
     """No confirmed track holds: the frame is acquired, unless it is the first to fail its test after one that held."""
     doubt = _doubt(followed, moment)
-    if state.confirmed and doubt == "residual" and state.failures == 1:  # one in many thousands fails by chance
+    if state.confirmed and followed and doubt == "residual" and state.failures == 1:  # one in many thousands, by chance
         return _coasting(state, detections, moment.context, doubt)
     return _acquired(state, followed, detections, moment, moment.acquire(), doubt=doubt)
 
 
 def _doubt(followed: Sequence[Track], moment: Moment) -> str:
-    """The word for hypotheses that do not hold: `too_few` where nothing speaks against what is seen."""
-    if not followed:
-        return ""
+    """The word for hypotheses that do not hold: `too_few` where nothing speaks against what is seen.
+
+    Lamps enough for a pose of which none is where it was predicted speak against the prediction.
+    """
     lamps, config = count_lamps(moment.frame), moment.context.config.track
+    if not followed:
+        return "residual" if lamps >= CHECKED_LIGHTS else ""
     return "too_few" if verify.explains(followed[0], lamps, config) else "residual"
 
 

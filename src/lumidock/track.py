@@ -214,6 +214,7 @@ def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
     bank, dt, q = _copied(track.bank), (t_ns - track.t_ns) * 1e-9, (config.accel_m_s2**2, config.accel_rad_s2**2)
     kernel.predict(state, dt, *q)
     bank_kernel.predict_bank(bank, state, dt, *q)
+    _add_stamp_error(state, bank, config.stamp_s)
     lately = t_ns - track.seen.agreed_ns <= config.max_gap_s * 1e9
     return Track(
         t_ns=t_ns,
@@ -227,6 +228,16 @@ def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
         agreeing_frames=track.agreeing_frames if lately else 0,
         mean_deviate=track.mean_deviate,
     )
+
+
+def _add_stamp_error(state: FilterState, bank: Bank, stamp_s: float) -> None:
+    """Widen the pose, in place, by what the camera moves within the error of a stamp."""
+    R_dock_cam, (v, w) = state.R.T, state.x[kernel.TWIST : kernel.BIAS].reshape(2, 3)
+    turn = R_dock_cam @ w
+    moved = stamp_s * np.concatenate([R_dock_cam @ v - np.cross(R_dock_cam @ state.t, turn), turn])
+    spread = np.outer(moved, moved)
+    state.P[:6, :6] += spread
+    bank.P[bank.begun == 1, :6, :6] += spread
 
 
 def update_attitude(track: Track, attitude: Attitude) -> Track:
@@ -336,7 +347,7 @@ def _bank_updated(
     before: Track, after: Track, frame: Measurements, model: StationModel, config: TrackConfig, *, starting: bool
 ) -> Track:
     """The updated track with its bank updated too, which is still that of the track `before`."""
-    bank, seen = _copied(before.bank), Assigned(after.last.assignment, frame.uv, frame.cov)
+    bank, seen = _copied(before.bank), Assigned(after.last.assignment, frame.uv, frame.cov * config.memory)
     rules = BankRules(
         group=model.group,
         layer=model.layer,
@@ -379,10 +390,11 @@ def _update(
         plane=NO_PLANE if guess and guess.turn_cov is None else plane,
         turn_cov=turn_cov,
     )
-    seen = Assigned(assignment, frame.uv, frame.cov)
+    seen = Assigned(assignment, frame.uv, frame.cov * config.memory)
     nis = update_kernel.update(model.lights, track.state, state, seen, rules)
     if not math.isfinite(nis):
         return None
+    nis *= config.memory  # of the innovation against the covariance of one frame alone
     # a pose of which nothing was known takes up six of the pixels' degrees of freedom
     deviate = _deviate(nis, 2 * sum(count) - (6 if guess else 0))
     result = FrameResult(assignment, count, plane, nis, deviate)
