@@ -76,7 +76,7 @@ def test_a_light_that_is_off_is_named_by_its_size(rng, light):
     found = contradiction(one, TAKEN, parameters(STATION, TAKEN), NOTHING_TOLD)
     assert (found.file, found.subject) == ("survey", STATION.ids[light])
     said = found.text.split()
-    assert (said[:3], said[4:]) == (["light", STATION.ids[light], "appears"], "cm from its surveyed position".split())
+    assert " ".join([*said[:3], *said[4:]]) == f"light {STATION.ids[light]} appears cm from its surveyed position"
     assert 3 <= int(said[3]) <= 5  # 4.1 cm, and the light's own honest error
 
 

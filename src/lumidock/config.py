@@ -269,8 +269,8 @@ class TrackConfig(SettingsGroup):
     # white noise on the velocity: what a second adds to it, 1 sigma
     accel_m_s2: Annotated[float, Field(ge=0.01, le=100.0)] = 0.3
     accel_rad_s2: Annotated[float, Field(ge=0.002, le=100.0)] = 0.05  # the same on the rotation rate
-    # 1 sigma of a stamp against the exposure, by which the pose is off along the motion: a driver's clock on a busy host
-    # has some milliseconds, a hardware trigger microseconds
+    # 1 sigma of a stamp against the exposure, by which the pose is off along the motion: a driver's clock on a busy
+    # host has some milliseconds, a hardware trigger microseconds
     stamp_s: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
     # factor on the covariance of centroids in the filter: errors with memory average out more slowly than white ones
     memory: Annotated[float, Field(ge=1.0, le=100.0)] = 1.0
