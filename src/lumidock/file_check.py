@@ -22,6 +22,7 @@ _TOLD_SHARE = (
 _SURE_SHARE = 0.1  # of the best known direction of a shift, that another needs to be stated too
 _CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 _CONTRADICTION_OF_WIDER = 10.8  # the same, 1e-3, of what is taken to be wider than declared: no honest file comes near
+_RELEASED = 0.5  # of the limit of a test: a contradiction that comes and goes with the noise would help nobody
 # of the best explanation; a wrong focal length and a layer that lies deeper explain the same, and a few per cent of a
 # focal length are likelier than some 20 cm of a dock
 _LENS_FIRST = 0.7
@@ -101,14 +102,14 @@ class DistortionTest(NamedTuple):
 
 
 def contradiction(
-    track: Track, station: Station, parameters: Parameters, distortion: DistortionTest
+    track: Track, station: Station, parameters: Parameters, distortion: DistortionTest, *, before: bool = False
 ) -> Contradiction | None:
     """The single error that explains best why the lights do not fit the files, where they contradict them.
 
     A score test: by how much the sum of squares falls if an error of any size is allowed beside what the files
     declare. With their covariance P0 and what the track has, x and P, the score of an error along e is e' P0^-1 x and
     its information e' P0^-1 (P0 - P) P0^-1 e; their quotient score^2 / information is chi-square of one degree of
-    freedom while the files hold.
+    freedom while the files hold. What was contradicted `before` is so until the test falls to half its limit.
     """
     if not track.estimates_calibration:
         return None
@@ -120,7 +121,7 @@ def contradiction(
     test = np.where(known, score**2 / np.maximum(information, 1e-300), 0.0)
     excess = test / parameters.limit
     worst, of_distortion = int(excess.argmax()), distortion.chi_square / _CONTRADICTION
-    if not max(excess[worst], of_distortion) > 1.0:
+    if not max(excess[worst], of_distortion) > (_RELEASED if before else 1.0):
         return None
     if of_distortion > excess[worst]:
         return distortion.in_words()

@@ -171,7 +171,9 @@ def assess(
     doubt, limits = _doubt(state, context) or (against.file if against else ""), context.station.alert_limits
     valid, used = not doubt and pose_holds(bound, limits), first.last.n_used
     now = stage(first, context.model) or state.stage
-    state = state if now == state.stage else replace(state, stage=now)
+    contradicted = against is not None
+    if (now, contradicted) != (state.stage, state.contradicted):
+        state = replace(state, stage=now, contradicted=contradicted)
     fix = Fix(
         detections.frame,
         detections.t_ns,
@@ -194,7 +196,9 @@ def assess(
 
 def _contradiction(state: LocalizerState, context: Context) -> Contradiction | None:
     """What the track's lights, or those of a layer that it cannot explain, say against the files."""
-    return state.contradiction or contradiction(state.first, context.station, context.parameters, state.distortion)
+    return state.contradiction or contradiction(
+        state.first, context.station, context.parameters, state.distortion, before=state.contradicted
+    )
 
 
 def alternatives(tracks: Sequence[Track]) -> tuple[Alternative, ...]:

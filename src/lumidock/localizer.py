@@ -17,12 +17,12 @@ from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Fix, Frame
 from lumidock.digest import Digest
 from lumidock.errors import FrameError, InputError
-from lumidock.light_counts import CHECKED_LIGHTS, MAX_DETECTIONS, MAX_LIGHTS, POSE_LIGHTS
+from lumidock.light_counts import CHECKED_LIGHTS, MAX_DETECTIONS, MAX_LIGHTS, MAX_TRACK_BYTES, POSE_LIGHTS
 from lumidock.match import Acquisition
 from lumidock.model import count_lamps, measurements, possible_lamps
 from lumidock.state import Context, LocalizerState
 from lumidock.station import Station
-from lumidock.track import Track, learned_calibration, sees_two_layers
+from lumidock.track import Track, learned_calibration, sees_two_layers, track_bytes
 from lumidock.tracking import Prediction
 
 
@@ -30,11 +30,15 @@ class Localizer:
     """Frames or detections in, one fix each out; remembers the frames before, in `state`, unless `cold`."""
 
     def __init__(self, station: Station, camera: Camera, config: Config | None = None, *, cold: bool = False) -> None:
-        """Raises: InputError for a station with more lights than the filter can carry."""
+        """Raises: InputError for a station with more lights, or more hypotheses of it, than the filter can carry."""
         if len(station) > MAX_LIGHTS:
             raise InputError(f"{station.name}: {len(station)} lights; wanted at most {MAX_LIGHTS}")
         self.station, self.camera, self.cold = station, camera, cold
         self.config = config or Config()
+        most = MAX_TRACK_BYTES // track_bytes(len(station))
+        if self.config.track.hypotheses > most:
+            wanted = f"track.hypotheses: {self.config.track.hypotheses} of {len(station)} lights do not fit in memory"
+            raise InputError(f"{station.name}: {wanted}; wanted at most {most}")
         self.context = Context.of(station, camera, self.config, cold=cold)
         self.state = LocalizerState()
         self.scan: detect.Scan | None = None

@@ -22,7 +22,7 @@ from lumidock._kernels.tracking.track import FilterState, PredictedMeasurements
 from lumidock._kernels.tracking.update import Assigned, UpdateRules
 from lumidock.config import Config, TrackConfig
 from lumidock.datatypes import Array, Attitude, Indices
-from lumidock.light_counts import CHECKED_LIGHTS, LAYER_LIGHTS
+from lumidock.light_counts import CHECKED_LIGHTS, LAYER_LIGHTS, MAX_SUBSETS
 from lumidock.match import Hypothesis
 from lumidock.model import AttitudePrior, StationModel
 from lumidock.station import Station
@@ -141,6 +141,12 @@ def learned_calibration(track: Track) -> CalibrationStates:
     P[: kernel.BIAS] = 0.0
     P[:, : kernel.BIAS] = 0.0
     return CalibrationStates(x, P)
+
+
+def track_bytes(n_lights: int) -> int:
+    """Memory of one hypothesis of a station with so many lights: the covariances of its filter and of its bank."""
+    n = kernel.LIGHTS + 3 * n_lights
+    return 8 * n * n * (1 + min(n_lights, MAX_SUBSETS))
 
 
 def open_bank(model: StationModel) -> Bank:
