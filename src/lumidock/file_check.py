@@ -20,8 +20,9 @@ _TOLD_SHARE = (
     0.02  # least share of what perfect images would tell, that they told; below, linearisation errors dominate
 )
 _SURE_SHARE = 0.1  # of the best known direction of a shift, that another needs to be stated too
-_CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
-_CONTRADICTION_OF_WIDER = 10.8  # the same, 1e-3, of what is taken to be wider than declared: no honest file comes near
+# chi-square, 1 dof, 6 sigma; errors of centroids that have memory look like a shift and reach 28 (faults/noise-memory)
+_CONTRADICTION = 36.0
+_CONTRADICTION_OF_FOCAL = 10.8  # the same, 1e-3, of a focal length that is taken to be wider than declared
 _RELEASED = 0.5  # of the limit of a test: a contradiction that comes and goes with the noise would help nobody
 # of the best explanation; a wrong focal length and a layer that lies deeper explain the same, and a few per cent of a
 # focal length are likelier than some 20 cm of a dock
@@ -56,9 +57,7 @@ def parameters(station: Station, taken: Station) -> Parameters:
     weights = directions @ np.linalg.pinv(P, hermitian=True)  # what is declared exact is not tested
     limit = np.full(len(directions), _CONTRADICTION)
     if taken.sigma_focal > station.sigma_focal:
-        limit[0] = _CONTRADICTION_OF_WIDER
-    if taken.sigma_layer_m > station.sigma_layer_m:
-        limit[len(P) :] = _CONTRADICTION_OF_WIDER
+        limit[0] = _CONTRADICTION_OF_FOCAL
     return Parameters(weights, P, np.asarray((weights * directions).sum(axis=1)), limit)
 
 
@@ -119,13 +118,13 @@ def contradiction(
     information = (spread * weights).sum(axis=1)
     known = information > _TOLD_SHARE * parameters.most
     test = np.where(known, score**2 / np.maximum(information, 1e-300), 0.0)
-    excess = test / parameters.limit
-    worst, of_distortion = int(excess.argmax()), distortion.chi_square / _CONTRADICTION
-    if not max(excess[worst], of_distortion) > (_RELEASED if before else 1.0):
+    excess, of_distortion = float((test / parameters.limit).max()), distortion.chi_square / _CONTRADICTION
+    if not max(excess, of_distortion) > (_RELEASED if before else 1.0):
         return None
-    if of_distortion > excess[worst]:
+    if of_distortion > excess:
         return distortion.in_words()
-    if worst == 0 or excess[0] > _LENS_FIRST * excess[worst]:
+    worst = int(test.argmax())
+    if worst == 0 or test[0] > _LENS_FIRST * test[worst]:
         return focal_length(float(score[0] / information[0]))
     first = 1 if worst < _LENS else worst - (worst - _LENS) % 3
     group = np.arange(first, _LENS if worst < _LENS else first + 3)

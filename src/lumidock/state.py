@@ -64,7 +64,8 @@ class LocalizerState:
     `failures`: frames since the first hypothesis last held. `stage`: docking stage of the last fix. `last`: detections
     of the frame before. `calibration`: what an earlier track has learned of survey and calibration. `contradiction`:
     a layer in view contradicts the files, and no frame since has shown two layers that fit together. `distortion`: what
-    all innovations say of it. `contradicted`: the last frame that could tell contradicted a file. `digest`: of the frame's picture, where there is one.
+    all innovations say of it. `contradicted`: the last frame that could tell contradicted a file. `digest`: of the
+    frame's picture, where there is one.
     """
 
     hypotheses: tuple[Track, ...] = ()
