@@ -221,7 +221,7 @@ def test_a_campaign_prints_its_table(lumidock, tmp_path):
 
 
 def test_a_campaign_of_faults_has_a_table_of_its_own(lumidock, tmp_path):
-    few = ("--set", "path.frame_interval_s=0.5", "--set", "path.start_z_m=12", "--workers", 0)
+    few = ("--set", "path.frame_interval_s=0.5", "--set", "path.start_z_m=12", "--workers", 1)
     code, out, _ = lumidock("campaign", "faults/none", "faults/twin", "--seeds", "0:1", *few, "--out", tmp_path / "out")
     assert code == 0
     rows = [line.strip("| ").split(" | ") for line in out.split("**Avail")[0].splitlines() if "|" in line]
