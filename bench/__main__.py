@@ -13,6 +13,7 @@ from pathlib import Path
 
 from bench import (
     acquisition,
+    aiding,
     association,
     configuration,
     contact_sheet,
@@ -24,6 +25,7 @@ from bench import (
     faults,
     images,
     lamp_weights,
+    learned_matcher,
     nominal,
     rendering,
     reproduced,
@@ -43,6 +45,8 @@ BENCHES = {
     "detector-errors": detector_errors,
     "detector-constants": detector_constants,
     "lamp-weights": lamp_weights,
+    "learned-matcher": learned_matcher,
+    "aiding": aiding,
     "dockings": dockings,
     "faults": faults,
     "docks": docks,

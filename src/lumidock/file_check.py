@@ -20,8 +20,7 @@ _TOLD_SHARE = (
     0.02  # least share of what perfect images would tell, that they told; below, linearisation errors dominate
 )
 _SURE_SHARE = 0.1  # of the best known direction of a shift, that another needs to be stated too
-# chi-square, 1 dof, 6 sigma; errors of centroids that have memory look like a shift and reach 28 (faults/noise-memory)
-_CONTRADICTION = 36.0
+_CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 _CONTRADICTION_OF_FOCAL = 10.8  # the same, 1e-3, of a focal length that is taken to be wider than declared
 _RELEASED = 0.5  # of the limit of a test: a contradiction that comes and goes with the noise would help nobody
 # of the best explanation; a wrong focal length and a layer that lies deeper explain the same, and a few per cent of a
@@ -112,7 +111,8 @@ def contradiction(
     """
     if not track.estimates_calibration:
         return None
-    x, P = track.state.x[CALIBRATION:], track.state.P[CALIBRATION:, CALIBRATION:]
+    own = slice(CALIBRATION, CALIBRATION + len(parameters.declared))
+    x, P = track.state.x[own], track.state.P[own, own]
     weights = parameters.weights
     score, spread = weights @ x, weights @ (parameters.declared - P)
     information = (spread * weights).sum(axis=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from lumidock.aiding import NO_AIDING, AidingState
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Contradiction, Detections, Stage
@@ -65,7 +66,8 @@ class LocalizerState:
     of the frame before. `calibration`: what an earlier track has learned of survey and calibration. `contradiction`:
     a layer in view contradicts the files, and no frame since has shown two layers that fit together. `distortion`: what
     all innovations say of it. `contradicted`: the last frame that could tell contradicted a file. `digest`: of the
-    frame's picture, where there is one.
+    frame's picture, where there is one. `aiding`: the vehicle's own sensors. `dark_frames`: frames in a row in which no
+    light held the track.
     """
 
     hypotheses: tuple[Track, ...] = ()
@@ -82,6 +84,8 @@ class LocalizerState:
     distortion: DistortionTest = NOTHING_TOLD
     contradicted: bool = False
     digest: Digest | None = None
+    aiding: AidingState = NO_AIDING
+    dark_frames: int = 0
 
     @property
     def first(self) -> Track:

@@ -13,8 +13,9 @@ from itertools import pairwise
 import numpy as np
 
 from lumidock.camera import Camera
-from lumidock.datatypes import Array, Attitude, Detections, Indices
+from lumidock.datatypes import AidingMeasurement, Array, Attitude, Detections, Indices
 from lumidock.pose import project_lights
+from lumidock.sim.aiding import sensor_values
 from lumidock.sim.course import Course, course_of, mirror_image, project_each, shines
 from lumidock.sim.draws import Draw
 from lumidock.sim.fault_knobs import PointFaults
@@ -56,6 +57,7 @@ class SimulatedFrame:
     Pose `T_dock_cam` (4, 4); the index `light` (S,) of the light that made each detection, -1 for a spurious one; the
     pixels `uv` (M, 2) of all lights with their true positions and the true lens; and which lights would be seen if none
     were dark, `in_view` (M,). The frame is number `step` of run number `sequence`; before step 0 there is no history.
+    `aiding`: what the vehicle's own sensors have said since the frame before.
     """
 
     detections: Detections
@@ -65,6 +67,7 @@ class SimulatedFrame:
     in_view: np.ndarray
     sequence: int = 0
     step: int = 0
+    aiding: tuple[AidingMeasurement, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,6 +131,7 @@ def simulated_frames(scenario: Scenario, station: Station, camera: Camera, seed:
     wander = _wandering(scenario, camera, course, np.random.default_rng([seed, Draw.WANDERING_LIGHTS]))
     table, visible, uv = _detected(run, wander, rng, detector_rng)
     attitudes = _attitudes(scenario, course, np.random.default_rng([seed, Draw.ATTITUDE]))
+    aiding = sensor_values(scenario, course, seed)
     stream_rng = np.random.default_rng([seed, Draw.POINT_STREAM])
     appearance = _appearance(run, table, rng, detector_rng, np.random.default_rng([seed, Draw.POINT_NOISE]))
     stamped = replace(course, t_ns=stamps_ns(course, faults, stream_rng))
@@ -141,6 +145,7 @@ def simulated_frames(scenario: Scenario, station: Station, camera: Camera, seed:
             visible[number],
             sequence=int(course.run[number]),
             step=int(course.step[number]),
+            aiding=aiding[number],
         )
         for number, (frame, (a, b)) in enumerate(zip(detections, pairwise(_bounds(course, table)), strict=True))
     ]

@@ -30,4 +30,5 @@ class Draw(IntEnum):
     POINT_NOISE = 19
     HOT_PIXELS = 20
     JELLYFISH = 21
-    POINT_STREAM = 22
+    POINT_STREAM = 23
+    AIDING = 22
