@@ -137,9 +137,10 @@ def plan(
     inputs = {path.name: _digest(path.read_bytes()) for path in (*stations, camera_file)}
     shared = {"lumidock": f"{version('lumidock')}+{source_digest()}", "inputs": inputs, "cold": cold, "bound": bound}
     shards = []
-    unique = {scenario.model_dump_json(): path for scenario, path in zip(scenarios, stations, strict=True)}
-    for scenario, path in unique.items():
-        parsed, station = Scenario.model_validate_json(scenario), load_station(path)
+    pairs = zip(scenarios, stations, strict=True)
+    unique = {scenario.model_dump_json(): (scenario, path) for scenario, path in pairs}
+    for scenario, (parsed, path) in unique.items():
+        station = load_station(path)
         own_inputs = {name: inputs[name] for name in (path.name, camera_file.name)}
         config = validate(Config, parsed.config, f"{parsed.name}: config")
         for method in dict.fromkeys(methods):
