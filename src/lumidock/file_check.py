@@ -45,7 +45,7 @@ class Parameters(NamedTuple):
 
 
 def parameters(station: Station, taken: Station) -> Parameters:
-    """The parameters of a station; `taken` is the same with the sigmas that the filter takes in place of the file's."""
+    """The parameters of a station; `taken` has the sigmas that the filter assumes instead of the file's."""
     P = calibration_prior(taken, None).P[CALIBRATION:, CALIBRATION:]
     errors = [np.eye(len(P))]
     if len(station.layers) > 1:

@@ -182,7 +182,7 @@ def _run(
     as_json: AsJson = False,
 ) -> None:
     """Find the camera's pose in every frame of SOURCE."""
-    from lumidock.app.run import Setup, contradictions_in_words
+    from lumidock.app.run import Setup
     from lumidock.app.run import run as run_source
     from lumidock.streams.run_folder import RunFolder
 
@@ -222,7 +222,6 @@ def _run(
 
         summary = run_source(opened, localizer, folder, setup, on_fix=on_fix, size=(lens.width, lens.height))
     _print_counts(summary.as_dict(), out, as_json)
-    tell(contradictions_in_words(summary.as_dict()))
 
 
 def _require_another_folder(out: Path, source: Path) -> None:
@@ -232,7 +231,10 @@ def _require_another_folder(out: Path, source: Path) -> None:
 
 
 def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:
-    """The counts of a run, for people or as JSON."""
+    """The counts of a run, for people or as JSON; what contradicts the files in words, beside them."""
+    from lumidock.app.run import contradictions_in_words
+
+    tell(contradictions_in_words(counts))
     if as_json:
         print(json.dumps(counts, indent=2))
         return
