@@ -220,6 +220,20 @@ def test_a_campaign_prints_its_table(lumidock, tmp_path):
     assert "nothing was left to do" in lumidock(*words)[1]
 
 
+def test_a_campaign_of_faults_has_a_table_of_its_own(lumidock, tmp_path):
+    few = ("--set", "path.frame_interval_s=0.5", "--set", "path.start_z_m=12", "--workers", 1)
+    code, out, _ = lumidock("campaign", "faults/none", "faults/twin", "--seeds", "0:1", *few, "--out", tmp_path / "out")
+    assert code == 0
+    rows = [line.strip("| ").split(" | ") for line in out.split("**Avail")[0].splitlines() if "|" in line]
+    head = dict(zip(rows[0], rows[2], strict=True))
+    assert (head["fault"], head["assumptions"], head["misleading"], head["over level"]) == ("none", "inside", "0", "0")
+    assert int(head["frames"]) > 20
+    assert rows[3][:2] == ["twin", "outside"]
+    table = json.loads((tmp_path / "out" / "table.json").read_text())
+    for row in table["rows"]:
+        assert row["counts"]["over_level"] >= max(row["counts"].get(f"over_level_{k}", 0) for k in ("lateral", "axial"))
+
+
 def test_a_scenario_file_and_its_config_are_used(lumidock, tmp_path):
     (tmp_path / "my.yaml").write_text(
         "name: a|b/../c\nabout: x\npath: {kind: draws, count: 3}\nconfig: {paper: {max_detections: 2}}\n"

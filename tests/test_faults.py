@@ -8,12 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lumidock import tracking
 from lumidock.camera import load_camera
 from lumidock.config import Config
 from lumidock.datatypes import Detections
+from lumidock.digest import Digest
 from lumidock.errors import InputError
 from lumidock.evaluation import claims
 from lumidock.localizer import Localizer
+from lumidock.model import measurements
 from lumidock.pose import project_lights
 from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import load_scenario
@@ -82,7 +85,7 @@ def test_a_vehicle_that_hovers_is_not_frozen(rng):
 
 
 def test_a_focal_length_that_is_wrong_ends_the_trust_in_the_calibration():
-    frames = frames_of("lens.focal_error=0.04", "path.end_z_m=3")
+    frames = frames_of("lens.focal_error=0.045", "path.end_z_m=3")
     reasons = [fix.reason for fix in play(frames)]
     assert "calibration" in reasons
     assert "" not in reasons[reasons.index("calibration") :]
@@ -155,8 +158,68 @@ def test_a_frame_that_leaves_its_answer_open_lists_the_poses_that_fit(rng):
         {"match": {"noise_px": 1e-3}},
         {"match": {"max_work": 10**9}},
         {"track": {"hypotheses": 10_000}},
+        {"track": {"max_nodes": 10**9}},
+        {"track": {"accel_m_s2": 1e-6}},
+        {"track": {"start_m_s": 1e-6}},
+        {"track": {"gate": 1e6}},
+        {"track": {"deviate_memory": 1.0}},
+        {"track": {"memory": 0.5}},
+        {"match": {"margin": 0.1}},
+        {"match": {"margin_gathered": 1e-3}},
+        {"match": {"log_mirror": 1000.0}},
+        {"match": {"least_detections": 10**9}},
+        {"prior": {"roll_deg": 1e-6}},
+        {"integrity": {"evidence": 1.0}},
+        {"integrity": {"gathered_frames": 1}},
+        {"integrity": {"fault": 1e-9}},
+        {"detect": {"max_lights": 10**9}},
+        {"detect": {"floor_px": 1e-9}},
+        {"paper": {"max_detections": 10**9}},
     ],
 )
 def test_settings_that_would_undo_the_protection_are_refused(tree):
     with pytest.raises(InputError, match=next(iter(next(iter(tree.values()))))):
         validate(Config, tree, "config.yaml")
+
+
+def test_hypotheses_that_do_not_fit_in_memory_are_refused_with_the_bound_that_holds():
+    many, n = Config.model_validate({"track": {"hypotheses": 256}}), 120
+    p_dock = np.random.default_rng(0).uniform(-2.0, 2.0, (n, 3))
+    large = replace(
+        STATION,
+        ids=tuple(f"L{k}" for k in range(n)),
+        layers=("front",),
+        layer=np.zeros(n, np.int64),
+        p_dock=p_dock,
+        color=("white",) * n,
+        axis=np.tile([0.0, 0.0, 1.0], (n, 1)),
+        beam_deg=np.full(n, 120.0),
+        power_w=np.full(n, 2.0),
+    )
+    with pytest.raises(InputError, match=r"track\.hypotheses: 256 of 120 lights .* wanted at most (\d+)") as caught:
+        Localizer(large, CAMERA, many)
+    most = int(str(caught.value).rsplit(" ", 1)[1])
+    assert 32 <= most < 256
+    Localizer(STATION, CAMERA, many)
+
+
+def test_a_frozen_picture_of_one_light_is_told_by_its_pixels(rng):
+    """A track on one light, whose picture repeats but for a decoder's noise, while it moves."""
+    frames = frames_of()[:30]
+    scene = rng.integers(0, 60, (CAMERA.height, CAMERA.width)).astype(np.uint8)
+    localizer = Localizer(STATION, CAMERA)
+    for frame in frames[:25]:
+        localizer.process_detections(frame.detections)
+    used = int(localizer.state.first.last.assignment.max())
+    held = frames[24].detections
+    one = Detections.from_uv("held", held.t_ns, held.uv[used : used + 1], p_rear=held.p_rear[used : used + 1])
+    digest = Digest.of(scene).next(np.roll(scene, 1, axis=0)).next(np.roll(scene, 2, axis=0))
+    again = replace(one, t_ns=frames[25].detections.t_ns, uv=one.uv + 0.01)
+    for picture, said in ((np.roll(scene, 2, axis=0), True), (np.roll(scene, 3, axis=0), False)):
+        state = replace(localizer.state, last=one, digest=digest.next(picture))
+        predicted = tracking.predict(state, again.t_ns, localizer.context)
+        frame = measurements(again, localizer.context.model, localizer.config.match)
+        last = replace(predicted.tracks[0].last, assignment=np.where(np.arange(13) == 0, 0, -1), count=(1, 0))
+        first = replace(predicted.tracks[0], last=last)
+        moved = replace(predicted, tracks=(first,), measurements=None)
+        assert tracking.is_frozen(state, moved, frame, localizer.context) == said

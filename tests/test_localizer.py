@@ -108,7 +108,9 @@ def test_the_covariance_of_valid_poses_is_honest():
     assert 0.0 < claims.nees(errors, np.array([x.covariance for _, x in both])).mean() < 7.0
 
 
-EXACT = replace(STATION, sigma_light_m=0.0, sigma_layer_m=0.0, sigma_focal=0.0, sigma_center_px=0.0)
+EXACT = replace(
+    STATION, sigma_light_m=0.0, sigma_layer_m=0.0, sigma_focal=0.0, sigma_center_px=0.0, calibration_stated=True
+)
 
 
 def cramer_rao(T_dock_cam, lights, sigma_px=0.5):

@@ -87,7 +87,9 @@ def column(out, name):
 def without_latency(out):
     """Content of all files of a run, latencies dropped."""
     contents = {path.name: path.read_bytes() for path in out.iterdir()}
-    contents["fixes.csv"] = [line.rsplit(b",", 1)[0] for line in contents["fixes.csv"].splitlines()]
+    rows = [line.split(b",") for line in contents["fixes.csv"].splitlines()]
+    latency = rows[0].index(b"latency_us")
+    contents["fixes.csv"] = [row[:latency] + row[latency + 1 :] for row in rows]
     description = json.loads(contents["run.json"])
     del description["counts"]["latency_us"]
     return contents | {"run.json": description}

@@ -32,7 +32,7 @@ from lumidock.datatypes import Attitude
 from lumidock.evaluation import claims
 from lumidock.geometry import se3_adjoint, se3_exp, se3_inverse, so3_exp, so3_log
 from lumidock.localizer import Localizer
-from lumidock.model import measurements
+from lumidock.model import believed, measurements
 
 
 @cache
@@ -124,7 +124,7 @@ def test_update_is_the_schmidt_kalman_filters(both, rng):
     after = track.update(one, assigned(lights), measured(uv), MODEL, CONFIG.track)
     assert_close(after.T_cam_dock, one.T_cam_dock, atol=1e-9)
     assert after.estimates_calibration == both
-    H, C = jacobian(one, lights), np.eye(2 * len(lights)) * CONFIG.match.noise_px**2
+    H, C = jacobian(one, lights), np.eye(2 * len(lights)) * CONFIG.match.noise_px**2 * CONFIG.track.memory
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + C)
     K[n if both else kernel.CALIBRATION :] = 0.0
     keep = np.eye(n) - K @ H
@@ -138,9 +138,10 @@ def test_nis_is_that_of_the_innovation(rng):
     one = replace(begun(head_on(), BOTH, rng), estimates_calibration=True)
     uv = pixels(one.T_cam_dock, one.state.x, BOTH) + rng.normal(0, 0.4, (M, 2))
     after = track.update(one, assigned(BOTH), measured(uv), MODEL, CONFIG.track)
-    H, C = jacobian(one, BOTH), np.eye(2 * M) * CONFIG.match.noise_px**2
+    memory = CONFIG.track.memory
+    H, C = jacobian(one, BOTH), np.eye(2 * M) * CONFIG.match.noise_px**2 * memory
     nu = (uv - pixels(one.T_cam_dock, one.state.x, BOTH)).ravel()
-    assert_close(after.last.nis, nu @ np.linalg.solve(H @ one.state.P @ H.T + C, nu), rtol=0.01)
+    assert_close(after.last.nis, memory * nu @ np.linalg.solve(H @ one.state.P @ H.T + C, nu), rtol=0.01)
     moved = se3_inverse(one.T_cam_dock) @ after.T_cam_dock
     expected = one.state.P @ H.T @ np.linalg.solve(H @ one.state.P @ H.T + C, nu)
     assert_close(moved[:3, 3], expected[:3], rtol=0.02, atol=1e-4)
@@ -170,7 +171,8 @@ def test_the_covariance_stays_symmetric_and_positive_over_an_approach():
 
 
 def test_survey_and_calibration_are_only_considered_before_both_layers_are_seen():
-    prior = track.calibration_prior(STATION, None).P[kernel.CALIBRATION :, kernel.CALIBRATION :]
+    taken = believed(STATION, CONFIG.files)
+    prior = track.calibration_prior(taken, None).P[kernel.CALIBRATION :, kernel.CALIBRATION :]
     tracks = followed()
     alone, both = [b for b in tracks if not b.estimates_calibration], [b for b in tracks if b.estimates_calibration]
     assert len(alone) > 5

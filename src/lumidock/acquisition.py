@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from lumidock import match, model, track, verify
+from lumidock import file_check, match, model, track, verify
 from lumidock._kernels.measurements import Measurements
-from lumidock.datatypes import Attitude, Indices
+from lumidock.datatypes import Attitude, Contradiction, Indices
 from lumidock.light_counts import CHECKED_LIGHTS, POSE_LIGHTS
 from lumidock.match import Acquisition, Hypothesis
 from lumidock.model import attitude_prior
@@ -43,6 +43,18 @@ class Moment:
         config, prior = self.context.config, attitude_prior(self.attitude, self.context.config.prior)
         twin = match.acquire(frame, self.context.model, self.context.camera, prior, config.match)
         return verify.is_answer(twin, config.match)
+
+    def displaced_layer(self, one: Track) -> Contradiction | None:
+        """What a layer says that is identified by itself although the track has no use for any of its lights."""
+        context, left = self.context, match.without(self.frame, one.last.assignment)
+        config, prior = context.config.match, attitude_prior(self.attitude, context.config.prior)
+        for k, alone in enumerate(context.layer_alone):
+            if alone is None or one.last.count[k] or model.count_lamps(left) < CHECKED_LIGHTS:
+                continue
+            found = match.acquire(left._replace(like=left.like[:, [k]]), alone, context.camera, prior, config)
+            if verify.is_answer(found, config):
+                return file_check.displaced_layer(one, context.station, k, found.hypotheses[0].T_cam_dock)
+        return None
 
     def start(self, hypothesis: Hypothesis, calibration: CalibrationStates | None) -> Track | None:
         """A new track from a hypothesis and what is known of survey and calibration; None for two lights or fewer."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, PositiveInt, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, model_validator
 
 from lumidock.yamlfile import read_mapping, validate
 
@@ -13,6 +13,11 @@ PositiveFloat = Annotated[float, Field(ge=1e-12, le=1e9)]  # its square, and one
 Risk = Annotated[float, Field(ge=1e-12, le=1e-2)]  # a larger one protects nothing, a smaller one no normal tail backs
 Age = Annotated[float, Field(gt=0.0, le=5.0)]  # s; after it the vehicle's motion is anyone's guess
 NoisePx = Annotated[float, Field(ge=0.05, le=100.0)]  # no detector is better than a twentieth of a pixel
+LogOdds = Annotated[float, Field(ge=4.6, le=1e3)]  # ln 100: less proves nothing
+Gate = Annotated[float, Field(ge=6.0, le=100.0)]  # chi-square, 2 dof: 5 % to less than 1e-21 of the true ones outside
+Degrees = Annotated[float, Field(ge=0.1, le=180.0)]  # no vehicle is held, and no prior known, more exactly
+LogPrior = Annotated[float, Field(ge=-100.0, le=20.0)]
+Count = Annotated[int, Field(ge=1, le=10_000)]  # work of a frame: more does not end within a second
 Work = Annotated[int, Field(ge=1, le=10_000_000)]  # 15 s of search
 Hypotheses = Annotated[int, Field(ge=1, le=256)]  # each holds a bank of covariances, 0.4 MB with 13 lights
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -44,16 +49,14 @@ class ExtractConfig(SettingsGroup):
     min_step: PositiveFloat = 4.0  # grey levels above the background mode below which nothing is a light
     class_gap: PositiveFloat = 5.0  # a core this many sigmas above its rim is cut out of it; a blurred disc has 3
     opening: Fraction = 0.5  # radius of the opening, as a share of the region's largest distance to its edge
-    min_area_px: PositiveInt = 4
+    min_area_px: Count = 4
     max_radius_px: PositiveFloat = 150.0
-    small_area_px: PositiveInt = 40  # below it the outline is too coarse for the two shape measures
+    small_area_px: Count = 40  # below it the outline is too coarse for the two shape measures
     min_roundness: Fraction = 0.60  # 4 pi area / perimeter^2
     min_compactness: Fraction = 0.55  # area / area of the fitted circle, or its inverse
     max_arc_error: Fraction = 0.06  # rms distance from the circle, of its radius, where the picture's edge cuts a light
-    max_thresholds: PositiveInt = 6  # tried in one frame; clean frames need one to three
-    max_regions: PositiveInt = (
-        80  # more mean that the threshold is still inside the noise; at last the largest are kept
-    )
+    max_thresholds: Count = 6  # tried in one frame; clean frames need one to three
+    max_regions: Count = 80  # more mean that the threshold is still inside the noise; at last the largest are kept
 
 
 class LayersConfig(SettingsGroup):
@@ -66,8 +69,8 @@ class LayersConfig(SettingsGroup):
     min_value: int = 25  # of 255
     min_blue: Fraction = 0.5  # share of the ring around the core that must be blue
     radius_gap: PositiveFloat = 0.25  # clusters differ by this share of the larger mean radius
-    min_cluster: PositiveInt = 4  # lights in each cluster
-    dual_frames: PositiveInt = 5  # T_cnt
+    min_cluster: Count = 4  # lights in each cluster
+    dual_frames: Count = 5  # T_cnt
 
 
 class PsoConfig(SettingsGroup):
@@ -90,7 +93,7 @@ class PsoConfig(SettingsGroup):
     w1: PositiveFloat = 1.0  # eq. (8), this frame's residual
     w2: Annotated[float, Field(ge=0.0)] = 0.3  # eq. (8), distance from the previous frame
     penalty: Annotated[float, Field(ge=0.0)] = 0.5  # eq. (7)
-    stagnation: PositiveInt = 12  # iterations without gain before a particle starts anew
+    stagnation: Count = 12  # iterations without gain before a particle starts anew
     seed: NonNegativeInt = 0
 
 
@@ -118,7 +121,7 @@ class BtekfConfig(SettingsGroup):
     accel_rad_s2: PositiveFloat = 0.15
     start_speed_m_s: PositiveFloat = 1.0  # 1 sigma of the unknown velocity at the first fix
     start_rate_rad_s: PositiveFloat = 0.1
-    max_nodes: PositiveInt = 400  # of the backtracking search
+    max_nodes: Count = 400  # of the backtracking search
     max_gap_s: PositiveFloat = 2.0  # older history is forgotten
 
 
@@ -150,8 +153,8 @@ class PaperConfig(SettingsGroup):
     layers: LayersConfig = LayersConfig()
     pso: PsoConfig = PsoConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
-    max_detections: PositiveInt = 200  # a frame with more is refused: `too_many`
-    max_lights: PositiveInt = 40  # of a layer; the ratio filter looks at all triples
+    max_detections: Count = 200  # a frame with more is refused: `too_many`
+    max_lights: Count = 40  # of a layer; the ratio filter looks at all triples
     btekf: BtekfConfig = BtekfConfig()
     pose: PoseConfig = PoseConfig()
 
@@ -186,18 +189,18 @@ class DetectConfig(SettingsGroup):
     mosaic_px: PositiveFloat = (
         0.5  # error of a point in blue or red of a mosaic, whose samples lie two pixels apart, 1 sigma
     )
-    floor_px: PositiveFloat = 0.04  # error of any centroid, 1 sigma
+    floor_px: Annotated[float, Field(ge=0.01, le=10.0)] = 0.04  # error of any centroid, 1 sigma
     live_sigmas: PositiveFloat = 5.0  # by which a tile's brightest pixels must stand out
     live_clear: PositiveFloat = 2.0  # the same, of the tiles around
     live_least: PositiveFloat = 0.05  # least such sigma, grey levels
-    margin_px: PositiveInt = 24  # of picture around what is searched: 3 sigma of the widest Gaussian of the third level
+    margin_px: Count = 24  # of picture around what is searched: 3 sigma of the widest Gaussian of the third level
     window_sizes: PositiveFloat = 4.0  # the same in a tracked frame, in sizes of the largest lamp of the frame before
     full_area_px: PositiveFloat = 6e5  # of the picture searched at full resolution; of more, coarser
     window_area_px: PositiveFloat = 1e5  # the same of all windows of a tracked frame
     square: PositiveFloat = 1.25  # ratio of the focal lengths up to which pixels count as square
     min_p_light: Fraction = 0.01  # less is no detection: a frame of matter has hundreds, and they cost the matcher time
-    max_blobs: PositiveInt = 4000  # maxima of a frame, over all planes and scales
-    max_lights: PositiveInt = 200  # detections of a frame; the strongest are kept
+    max_blobs: Count = 4000  # maxima of a frame, over all planes and scales
+    max_lights: Count = 200  # detections of a frame; the strongest are kept
 
 
 class LabelConfig(SettingsGroup):
@@ -216,9 +219,9 @@ class LabelConfig(SettingsGroup):
 class PriorConfig(SettingsGroup):
     """Prior of the camera's attitude about head-on where no sensor measures it, 1 sigma."""
 
-    roll_deg: PositiveFloat = 10.0
-    pitch_deg: PositiveFloat = 15.0
-    yaw_deg: PositiveFloat = 15.0
+    roll_deg: Degrees = 10.0
+    pitch_deg: Degrees = 15.0
+    yaw_deg: Degrees = 15.0
     # share of approaches with any roll, beyond `match.roll_gate`; poses that fit there are rivals of this weight
     any_roll: Annotated[float, Field(ge=1e-6, le=0.5)] = 1e-3
 
@@ -237,29 +240,31 @@ class MatchConfig(SettingsGroup):
     spurious: PositiveFloat = 5.0  # mean number of spurious detections in an image
     clutter_near: Fraction = 0.02  # share of spurious detections that lie as close together as the lights do
     clutter_margin_px: PositiveFloat = 100.0  # around the projected lights, within which such detections count
-    gate: PositiveFloat = 18.4  # squared Mahalanobis distance: chi-square, 2 dof, exceeded with 1e-4
-    pair_gate: PositiveFloat = 11.8  # the same for a light predicted from two others and the attitude; 0.3 %
+    gate: Gate = 18.4  # squared Mahalanobis distance: chi-square, 2 dof, exceeded with 1e-4
+    pair_gate: Gate = 11.8  # the same for a light predicted from two others and the attitude; 0.3 %
     bend: PositiveFloat = 0.7  # a tilt of variance s shortens the array by a share of this times s, 1 sigma
     roll_gate: PositiveFloat = 3.3  # sigmas of the prior, beyond which a roll counts as any
     near_m: PositiveFloat = 0.3  # least and ...
     far_m: PositiveFloat = 40.0  # ... greatest distance of a light
     hypotheses: Hypotheses = 64  # kept while lights are added to them
     # of more detections only the likeliest lamps are considered: so many, or `detections_per_light` times the lights
-    least_detections: PositiveInt = 16
-    detections_per_light: PositiveInt = 2
+    least_detections: Count = 16
+    detections_per_light: Count = 2
     # units of work of one frame's acquisition, a pose of two detections or a quarter of a fit, 1.4 us each (bench
     # `acquisition-time`); what is found before all is searched is no answer: `too_many`
     max_work: Work = 18_000
-    log_dock: float = 2.0  # log prior odds that the dock is in view at all
-    max_detections_three: PositiveInt = 14  # among more detections, three lights of a layer identify nothing
-    sure: PositiveFloat = 15.0  # log evidence above which associations of three lights a layer are not searched for
-    margin: PositiveFloat = 6.9  # log odds of an association that one frame decides, ln 1000
-    margin_gathered: PositiveFloat = 9.2  # the same gathered over frames, or with three lights; ln 10,000
-    lead: PositiveFloat = 3.5  # log odds by which a gathered hypothesis must also lead in the last frame alone
-    extra: PositiveFloat = 7.5  # log odds of an identified light beyond those four
-    prune: PositiveFloat = 5.0  # log odds below which an identified light is dropped in any case
-    keep: PositiveFloat = 14.0  # log evidence behind the best at which a hypothesis is dropped
-    log_mirror: float = -8.1  # log prior of seeing only the mirror image of the dock
+    log_dock: LogPrior = 2.0  # log prior odds that the dock is in view at all
+    max_detections_three: Count = 14  # among more detections, three lights of a layer identify nothing
+    sure: LogOdds = 15.0  # log evidence above which associations of three lights a layer are not searched for
+    margin: LogOdds = 6.9  # log odds of an association that one frame decides, ln 1000
+    margin_gathered: LogOdds = 9.2  # the same gathered over frames, or with three lights; ln 10,000
+    lead: Annotated[float, Field(ge=1.0, le=1e3)] = (
+        3.5  # log odds by which a gathered hypothesis must also lead in the last frame alone
+    )
+    extra: LogOdds = 7.5  # log odds of an identified light beyond those four
+    prune: LogOdds = 5.0  # log odds below which an identified light is dropped in any case
+    keep: LogOdds = 14.0  # log evidence behind the best at which a hypothesis is dropped
+    log_mirror: LogPrior = -8.1  # log prior of seeing only the mirror image of the dock
 
 
 class TrackConfig(SettingsGroup):
@@ -268,20 +273,29 @@ class TrackConfig(SettingsGroup):
     # white noise on the velocity: what a second adds to it, 1 sigma
     accel_m_s2: Annotated[float, Field(ge=0.01, le=100.0)] = 0.3
     accel_rad_s2: Annotated[float, Field(ge=0.002, le=100.0)] = 0.05  # the same on the rotation rate
-    start_m_s: PositiveFloat = 1.5  # 1 sigma of the unknown velocity at the start
-    start_rad_s: PositiveFloat = 0.15  # 1 sigma of the unknown rotation rate at the start
-    gate: PositiveFloat = 18.4  # squared Mahalanobis distance: chi-square, 2 dof, exceeded with 1e-4
+    # 1 sigma of a stamp against the exposure, by which the pose is off along the motion: a driver's clock on a busy
+    # host has some milliseconds, a hardware trigger microseconds; 10 ms keep the valid poses that 30 ms of jitter take
+    stamp_s: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
+    # factor on the covariance of centroids in the filter: errors with memory average out more slowly than white ones;
+    # 3 holds the levels where two thirds of the variance have a memory of 0.5-2 s (faults/noise-memory), and takes one
+    # valid pose in twenty; at 1 such errors end as `survey`
+    memory: Annotated[float, Field(ge=1.0, le=100.0)] = 1.0
+    start_m_s: Annotated[float, Field(ge=0.05, le=100.0)] = 1.5  # 1 sigma of the unknown velocity at the start
+    start_rad_s: Annotated[float, Field(ge=0.01, le=100.0)] = 0.15  # 1 sigma of the unknown rotation rate at the start
+    gate: Gate = 18.4  # squared Mahalanobis distance: chi-square, 2 dof, exceeded with 1e-4
     reach: PositiveFloat = 10.0  # log evidence behind the best at which an association is not followed
     max_nodes: Work = 100_000  # of the association's search, 0.1 us each; a hypothesis that needs more is dropped
-    log_appear: float = -6.9  # log prior that a layer comes into view in one frame
+    log_appear: LogPrior = -6.9  # log prior that a layer comes into view in one frame
     # 1 sigma to which the others predict a light that geometry proves; glints lie 2 cm and more beside the lamps
     proven_m: Annotated[float, Field(ge=1e-6, le=0.05)] = 0.01
     max_gap_s: Age = 2.0  # without lights; after it only the calibration states are kept
     max_deviate: Annotated[float, Field(ge=2.0, le=8.0)] = 4.0  # of one frame's NIS, as a standard normal deviate
     max_mean_deviate: Annotated[float, Field(ge=2.0, le=8.0)] = 3.5  # of the running mean of that deviate
-    deviate_memory: Fraction = 0.8  # share of the running mean that is kept from frame to frame
+    deviate_memory: Annotated[float, Field(ge=0.0, le=0.99)] = (
+        0.8  # share of the running mean that is kept from frame to frame
+    )
     hypotheses: Hypotheses = 32  # poses or associations followed side by side
-    forget: PositiveFloat = 16.0  # log odds behind the best at which one of them is dropped
+    forget: LogOdds = 16.0  # log odds behind the best at which one of them is dropped
 
 
 class IntegrityConfig(SettingsGroup):
@@ -297,10 +311,23 @@ class IntegrityConfig(SettingsGroup):
     evidence: Annotated[float, Field(ge=4.6, le=1e3)] = 13.8
     # frames in a row with four lights or more that agree, which meet it as well
     carried_frames: Annotated[int, Field(ge=2, le=10_000)] = 2
-    gathered_frames: PositiveInt = 15  # the same for an association that no single frame could decide
+    gathered_frames: Annotated[int, Field(ge=5, le=10_000)] = (
+        15  # the same for an association that no single frame could decide
+    )
     # frames in a row with fewer than four lights, after which a fresh acquisition must agree
     thin_frames: Annotated[int, Field(ge=1, le=30)] = 3
     max_age_s: Age = 0.3  # of the last detected light, up to which a fix is predicted
+
+
+class FilesConfig(SettingsGroup):
+    """What is believed of the station and the camera file; docs/safety-case.md says how smaller sigmas are earned."""
+
+    # least 1 sigma of a layer's rigid offset where the file declares one and the dock has several layers: what welding
+    # and tape leave over some metres; a survey from images declares none
+    layer_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.02
+    # least 1 sigma of the focal length, relative, where the station file states no calibration_sigma: a board gives
+    # 0.5-1 %, and the refractive index of water lies between 1.333, fresh and warm, and 1.344, salt and cold
+    focal: Annotated[float, Field(ge=0.0, le=0.1)] = 0.01
 
 
 Quaternion = tuple[float, float, float, float]
@@ -379,6 +406,7 @@ class Config(SettingsGroup):
     match: MatchConfig = MatchConfig()
     track: TrackConfig = TrackConfig()
     integrity: IntegrityConfig = IntegrityConfig()
+    files: FilesConfig = FilesConfig()
     aiding: AidingConfig = AidingConfig()
     detect: DetectConfig = DetectConfig()
     label: LabelConfig = LabelConfig()

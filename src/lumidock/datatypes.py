@@ -248,6 +248,18 @@ class Guide:
     pl_range_m: float
 
 
+@dataclass(frozen=True, slots=True)
+class Contradiction:
+    """What the lights say against a file, in one sentence `text`; `file` is the reason of the fix.
+
+    `subject`: the id of the light, the layer, or the parameter of the camera that is off.
+    """
+
+    file: Literal["calibration", "survey"]
+    subject: str
+    text: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Velocity:
     """The motion of `cam` in `dock`, in the axes of `cam`: `linear_m_s` (3,) and `angular_rad_s` (3,).
@@ -300,8 +312,9 @@ class Fix:
     innovation squared of a tracked frame over its degrees of freedom, 1 on average where noise is as stated; NaN
     without history. `n_seen` counts the frame's detections and `n_used` those behind the pose; `by_layer` holds what
     each layer's lights give alone, where a method works by layer. `alternatives`: the poses that fit while none is
-    proven, the likeliest first; never a fix. `velocity` comes with a pose or a guide from a method that knows it;
-    `aiding` says what became of each sensor that has given values.
+    proven, the likeliest first; never a fix. `contradiction`: what is wrong with which file, where that is the reason.
+    `velocity` comes with a pose or a guide from a method that knows it; `aiding` says what became of each sensor that
+    has given values.
     """
 
     frame: str
@@ -319,6 +332,7 @@ class Fix:
     guide: Guide | None = None
     nis: float = math.nan
     alternatives: tuple[Alternative, ...] = ()
+    contradiction: Contradiction | None = None
     velocity: Velocity | None = None
     aiding: tuple[SensorUse, ...] = ()
 

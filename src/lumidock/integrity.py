@@ -16,6 +16,7 @@ from lumidock.config import IntegrityConfig
 from lumidock.datatypes import (
     Alternative,
     Array,
+    Contradiction,
     Detections,
     Fix,
     Guide,
@@ -25,11 +26,12 @@ from lumidock.datatypes import (
     Status,
     Velocity,
 )
+from lumidock.file_check import contradiction
 from lumidock.geometry import se3_inverse
 from lumidock.model import StationModel, light_of
 from lumidock.state import Context, LocalizerState
 from lumidock.track import Track
-from lumidock.verify import contradict, contradicted_file, is_proven
+from lumidock.verify import contradict, is_proven
 
 _ANY_BEARING_RAD = math.sqrt(2.0) * math.pi  # at the origin itself a bearing says nothing ...
 _CLEAR, _STEEP_RAD = 2.0, 0.3  # ... which begins so many range levels away, or with such a bearing level
@@ -168,10 +170,14 @@ def assess(
     if status == "coasting" and (reason := _why_no_coasting(state, detections.t_ns, context)):
         return no_fix(state, detections, status, reason), state
     bound = bounds(state.hypotheses, context.model, config)
-    doubt, limits = _doubt(state, context), context.station.alert_limits
+    against = _contradiction(state, context)
+    doubt, limits = _doubt(state, context) or (against.file if against else ""), context.station.alert_limits
     valid, used = not doubt and pose_holds(bound, limits), first.last.n_used
+    reason = "" if valid else doubt or _why_wide(state, config)
     now = stage(first, context.model) or state.stage
-    state = state if now == state.stage else replace(state, stage=now)
+    contradicted = against is not None
+    if (now, contradicted) != (state.stage, state.contradicted):
+        state = replace(state, stage=now, contradicted=contradicted)
     fix = Fix(
         detections.frame,
         detections.t_ns,
@@ -180,15 +186,14 @@ def assess(
         n_seen=len(detections),
         n_used=used,
         T_dock_cam=bound.T_dock_cam if valid else None,
-        reason="" if valid else doubt or _why_wide(state, config),
+        reason=reason,
         match=Match(detections, light_of(first.last.assignment, len(detections))),
         covariance=bound.covariance if valid else None,
         protection=bound.protection if valid else None,
         guide=bound.guide if not doubt and guide_holds(bound, limits) else None,
         nis=first.last.nis / (2 * used) if status == "tracking" else math.nan,
-        alternatives=alternatives(state.hypotheses)
-        if not valid and (doubt or _why_wide(state, config)) in _OPEN
-        else (),
+        alternatives=alternatives(state.hypotheses) if reason in _OPEN else (),
+        contradiction=against if against and doubt == against.file else None,
         aiding=state.aiding.uses(detections.t_ns),
     )
     return (replace(fix, velocity=velocity(first)) if fix.valid or fix.guide else fix), state
@@ -207,6 +212,13 @@ def _why_wide(state: LocalizerState, config: IntegrityConfig) -> str:
     return "ambiguous" if any(contradict(first.last.assignment, r.last.assignment) for r in rivals) else "protection"
 
 
+def _contradiction(state: LocalizerState, context: Context) -> Contradiction | None:
+    """What the track's lights, or those of a layer that it cannot explain, say against the files."""
+    return state.contradiction or contradiction(
+        state.first, context.station, context.parameters, state.distortion, before=state.contradicted
+    )
+
+
 def alternatives(tracks: Sequence[Track]) -> tuple[Alternative, ...]:
     """The poses that hypotheses hold possible, with their probabilities among them."""
     if not tracks:
@@ -217,7 +229,7 @@ def alternatives(tracks: Sequence[Track]) -> tuple[Alternative, ...]:
 
 
 def _doubt(state: LocalizerState, context: Context) -> str:
-    """The word for a track that no level makes valid: another fits too, it is not proven, or the files are wrong."""
+    """The word for a track that no level makes valid: another fits too, or it is not proven."""
     first, config = state.first, context.config.integrity
     if not is_proven(first, state.margin, config):
         rivals = state.hypotheses[1:]
@@ -228,7 +240,7 @@ def _doubt(state: LocalizerState, context: Context) -> str:
     dark = state.dark_frames if state.aiding.carries(first.t_ns) else 0
     if state.thin_frames - dark >= config.thin_frames:
         return "unproven"
-    return contradicted_file(first, context.prior_var)[0]
+    return ""
 
 
 def _why_no_coasting(state: LocalizerState, t_ns: int, context: Context) -> str:

@@ -22,5 +22,8 @@ MAX_SUBSETS = 8
 MAX_LIGHTS = 128
 """Of a station: the filter carries three states a light, and a covariance of (18 + 3 * 128)^2 numbers is 1.3 MB."""
 
+MAX_TRACK_BYTES = 2**30
+"""Of all hypotheses that are followed at once, each with a covariance for every state of its bank."""
+
 MAX_DETECTIONS = 200
 """Of one frame: association and acquisition grow with their number; a frame with more is refused as `too_many`."""

@@ -15,13 +15,14 @@ from lumidock.acquisition import Moment
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import AidingMeasurement, Array, Detections, Fix, Frame
+from lumidock.digest import Digest
 from lumidock.errors import FrameError, InputError
-from lumidock.light_counts import CHECKED_LIGHTS, MAX_DETECTIONS, MAX_LIGHTS, POSE_LIGHTS
+from lumidock.light_counts import CHECKED_LIGHTS, MAX_DETECTIONS, MAX_LIGHTS, MAX_TRACK_BYTES, POSE_LIGHTS
 from lumidock.match import Acquisition
 from lumidock.model import count_lamps, measurements, possible_lamps
 from lumidock.state import Context, LocalizerState
 from lumidock.station import Station
-from lumidock.track import Track, learned_calibration, sees_two_layers
+from lumidock.track import Track, learned_calibration, sees_two_layers, track_bytes
 from lumidock.tracking import Prediction
 
 
@@ -29,11 +30,15 @@ class Localizer:
     """Frames or detections in, one fix each out; remembers the frames before, in `state`, unless `cold`."""
 
     def __init__(self, station: Station, camera: Camera, config: Config | None = None, *, cold: bool = False) -> None:
-        """Raises: InputError for a station with more lights than the filter can carry."""
+        """Raises: InputError for a station with more lights, or more hypotheses of it, than the filter can carry."""
         if len(station) > MAX_LIGHTS:
             raise InputError(f"{station.name}: {len(station)} lights; wanted at most {MAX_LIGHTS}")
         self.station, self.camera, self.cold = station, camera, cold
         self.config = config or Config()
+        most = MAX_TRACK_BYTES // track_bytes(len(station))
+        if self.config.track.hypotheses > most:
+            wanted = f"track.hypotheses: {self.config.track.hypotheses} of {len(station)} lights do not fit in memory"
+            raise InputError(f"{station.name}: {wanted}; wanted at most {most}")
         self.context = Context.of(station, camera, self.config, cold=cold)
         self.state = LocalizerState()
         self.scan: detect.Scan | None = None
@@ -59,6 +64,8 @@ class Localizer:
             raise FrameError("bad_frame", f"frame {frame.name} is {width}x{height}, the calibration {wanted}")
         if self.cold:
             self.forget()
+        digest = self.state.digest
+        self.state = replace(self.state, digest=digest.next(frame.image) if digest else Digest.of(frame.image))
         if self.scan is None or not self.scan.fits(frame):
             self.scan = detect.Scan(frame, self.config.detect, self.camera.focal_px[0] / self.camera.focal_px[1])
         predicted = tracking.predict(self.state, frame.t_ns, self.context)
@@ -69,6 +76,7 @@ class Localizer:
         """The fix of one frame's detections, by a detector of one's own."""
         if self.cold:
             self.forget()
+        self.state = replace(self.state, digest=None)
         return self._step(detections, tracking.predict(self.state, detections.t_ns, self.context))
 
     def search_windows(self, frame: Frame) -> Array | None:
@@ -96,8 +104,21 @@ def step(
     followed = tracking.follow(predicted, frame, context, confirmed=state.confirmed)
     moment = Moment(detections.t_ns, frame, detections.attitude, context)
     if state.confirmed and followed and verify.holds(followed[0], count_lamps(frame), context.config.track):
-        return _tracked(state, followed, detections, moment)
+        return _tracked(_told_of_distortion(state, predicted, followed, moment), followed, detections, moment)
     return _lost(replace(state, failures=state.failures + 1), followed, detections, moment)
+
+
+def _told_of_distortion(
+    state: LocalizerState, predicted: Prediction, followed: Sequence[Track], moment: Moment
+) -> LocalizerState:
+    """The state with the frame's innovation weighed against a distortion that the calibration leaves out."""
+    expected, one = predicted.measurements, followed[0]
+    if expected is None or not predicted.tracks[0].estimates_calibration or len(followed) > 1:
+        return state
+    return replace(
+        state,
+        distortion=state.distortion.with_frame(expected, one.last.assignment, moment.frame, moment.context.camera),
+    )
 
 
 def _why_refused(last: Detections | None, detections: Detections) -> str:
@@ -132,11 +153,14 @@ def _tracked(
     """A confirmed track holds; where it may overlook a layer, the frame is acquired anew to compare."""
     context = moment.context
     tracked = _checked(replace(state, hypotheses=tuple(followed), failures=0, dark_frames=0), moment)
+    if sees_two_layers(followed[0].last.count):
+        tracked = replace(tracked, contradiction=None)
     if not tracking.overlooks(followed[0], moment.frame, context):
         return integrity.assess(tracked, detections, "tracking", context)
     found = moment.acquire()
     if not _shows_two_layers(found, context):
-        return integrity.assess(replace(tracked, failures=1), detections, "tracking", context)
+        against = moment.displaced_layer(followed[0]) or tracked.contradiction
+        return integrity.assess(replace(tracked, failures=1, contradiction=against), detections, "tracking", context)
     # what the track has learned while it overlooked a layer is in doubt too; a failure, so that the next search is full
     doubted = replace(state, confirmed=False, calibration=None, failures=1)
     return _acquired(doubted, followed, detections, moment, found, still_held=followed[:1])
@@ -171,16 +195,19 @@ def _lost(
     """No confirmed track holds: the frame is acquired, unless it is the first to fail its test after one that held."""
     doubt, dark = _doubt(followed, moment), not followed and count_lamps(moment.frame) < CHECKED_LIGHTS
     state = replace(state, dark_frames=state.dark_frames + 1 if dark else 0)
-    if state.confirmed and doubt == "residual" and state.failures == 1:  # one in many thousands fails by chance
+    if state.confirmed and followed and doubt == "residual" and state.failures == 1:  # one in many thousands, by chance
         return _coasting(state, detections, moment.context, doubt)
     return _acquired(state, followed, detections, moment, moment.acquire(), doubt=doubt)
 
 
 def _doubt(followed: Sequence[Track], moment: Moment) -> str:
-    """The word for hypotheses that do not hold: `too_few` where nothing speaks against what is seen."""
-    if not followed:
-        return ""
+    """The word for hypotheses that do not hold: `too_few` where nothing speaks against what is seen.
+
+    Lamps enough for a pose of which none is where it was predicted speak against the prediction.
+    """
     lamps, config = count_lamps(moment.frame), moment.context.config.track
+    if not followed:
+        return "residual" if lamps >= CHECKED_LIGHTS else ""
     return "too_few" if verify.explains(followed[0], lamps, config) else "residual"
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from lumidock._kernels.measurements import Appearance, Measurements, weigh
 from lumidock._kernels.tracking.track import Lights
 from lumidock.camera import Camera
-from lumidock.config import MatchConfig, PriorConfig
+from lumidock.config import FilesConfig, MatchConfig, PriorConfig
 from lumidock.datatypes import Array, Attitude, Detections, Indices
 from lumidock.light_counts import MAX_SUBSETS
 from lumidock.station import Station
@@ -100,6 +100,17 @@ class AttitudePrior:
         c, s = math.cos(roll), math.sin(roll)
         turned = self.R_dock_cam @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return replace(self.rolled(), R_dock_cam=turned)
+
+
+def believed(station: Station, config: FilesConfig) -> Station:
+    """The station with the sigmas that the filter takes: never less than what such files are found to hold.
+
+    Acquisition keeps the declared ones: it takes a layer's offset as one of each light alone, and would lose evidence.
+    """
+    several = len(station.layers) > 1 and station.sigma_layer_m > 0.0
+    layer_m = max(station.sigma_layer_m, config.layer_m) if several else station.sigma_layer_m
+    focal = station.sigma_focal if station.calibration_stated else max(station.sigma_focal, config.focal)
+    return replace(station, sigma_layer_m=layer_m, sigma_focal=focal)
 
 
 def station_model(station: Station, camera: Camera, config: MatchConfig) -> StationModel:

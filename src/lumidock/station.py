@@ -34,7 +34,8 @@ class Station:
     Sigmas are 1-sigma survey and calibration errors: `sigma_light_m` of each light's position along each axis, one
     number for all lights or one for each (N,), and `sigma_layer_m` of a rigid offset that a layer's lights share.
     `alert_limits` decide when a pose or a guide may be used. `dock_exclusive` says that no other array of lights which
-    looks like this dock can come into view.
+    looks like this dock can come into view, and `calibration_stated` that the two sigmas of the calibration were
+    measured and are no defaults.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Station:
     sigma_center_px: float
     alert_limits: AlertLimits = DEFAULT_ALERT_LIMITS
     dock_exclusive: bool = True
+    calibration_stated: bool = False
 
     def __post_init__(self) -> None:
         n = len(self.ids)
@@ -73,6 +75,23 @@ class Station:
     def lights_of(self, layer: str) -> Indices:
         """Indices (K,) of the lights of one layer. Raises: ValueError for a layer the station does not have."""
         return np.flatnonzero(self.layer == self.layers.index(layer)).astype(np.int64)
+
+    def only(self, layer: str) -> Station:
+        """The station of one layer's lights alone. Raises: ValueError for a layer the station does not have."""
+        lights = self.lights_of(layer)
+        sigma = np.asarray(self.sigma_light_m)
+        return replace(
+            self,
+            ids=tuple(self.ids[k] for k in lights),
+            layers=(layer,),
+            layer=np.zeros(len(lights), np.int64),
+            p_dock=self.p_dock[lights],
+            color=tuple(self.color[k] for k in lights),
+            axis=self.axis[lights],
+            beam_deg=self.beam_deg[lights],
+            power_w=self.power_w[lights],
+            sigma_light_m=sigma[lights] if sigma.ndim else self.sigma_light_m,
+        )
 
     def layers_front_to_rear(self) -> tuple[str, ...]:
         """Layer names by falling mean z: the one nearest to the approaching vehicle first."""
@@ -199,6 +218,7 @@ def load_station(path: Path | str) -> Station:
         sigma_focal=content.calibration_sigma.focal,
         sigma_center_px=content.calibration_sigma.center_px,
         dock_exclusive=content.dock_exclusive,
+        calibration_stated="calibration_sigma" in content.model_fields_set,
     )
     try:
         return replace(station, alert_limits=_alert_limits(content, station.front_extent_m()))

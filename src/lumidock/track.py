@@ -22,7 +22,7 @@ from lumidock._kernels.tracking.track import FilterState, PredictedMeasurements
 from lumidock._kernels.tracking.update import Assigned, UpdateRules
 from lumidock.config import Config, TrackConfig
 from lumidock.datatypes import Array, Attitude, Indices
-from lumidock.light_counts import CHECKED_LIGHTS, LAYER_LIGHTS
+from lumidock.light_counts import CHECKED_LIGHTS, LAYER_LIGHTS, MAX_SUBSETS
 from lumidock.match import Hypothesis
 from lumidock.model import AttitudePrior, StationModel
 from lumidock.station import Station
@@ -144,6 +144,12 @@ def learned_calibration(track: Track) -> CalibrationStates:
     return CalibrationStates(x, P)
 
 
+def track_bytes(n_lights: int) -> int:
+    """Memory of one hypothesis of a station with so many lights: the covariances of its filter and of its bank."""
+    n = kernel.LIGHTS + 3 * n_lights
+    return 8 * n * n * (1 + min(n_lights, MAX_SUBSETS))
+
+
 def open_bank(model: StationModel, states: int = 0, sensors: int = 0) -> Bank:
     """A bank in which no subset has begun, of so many `states`, by default as many as the station needs.
 
@@ -259,6 +265,21 @@ def predict(
     )
 
 
+def with_stamp_error(track: Track, stamp_s: float) -> Track:
+    """A predicted track whose pose is wider by what the camera moves within the error of a frame's stamp.
+
+    It is changed in place, as its arrays are its own.
+    """
+    state, bank = track.state, track.bank
+    R_dock_cam, (v, w) = state.R.T, state.x[kernel.TWIST : kernel.BIAS].reshape(2, 3)
+    turn = R_dock_cam @ w
+    moved = stamp_s * np.concatenate([R_dock_cam @ v - np.cross(R_dock_cam @ state.t, turn), turn])
+    spread = np.outer(moved, moved)
+    state.P[:6, :6] += spread
+    bank.P[bank.begun == 1, :6, :6] += spread
+    return track
+
+
 def update_attitude(track: Track, attitude: Attitude) -> Track:
     """The track updated by the vehicle's own attitude."""
     state = FilterState(*(values.copy() for values in track.state))
@@ -366,7 +387,8 @@ def _bank_updated(
     before: Track, after: Track, frame: Measurements, model: StationModel, config: TrackConfig, *, starting: bool
 ) -> Track:
     """The updated track with its bank updated too, which is still that of the track `before`."""
-    seen, bank = Assigned(after.last.assignment, frame.uv, frame.cov), empty_like(before.bank)
+    seen = Assigned(after.last.assignment, frame.uv, frame.cov * config.memory)
+    bank = empty_like(before.bank)
     rules = BankRules(
         group=model.group,
         layer=model.layer,
@@ -407,10 +429,11 @@ def _update(
         plane=NO_PLANE if guess and guess.turn_cov is None else plane,
         turn_cov=turn_cov,
     )
-    seen = Assigned(assignment, frame.uv, frame.cov)
+    seen = Assigned(assignment, frame.uv, frame.cov * config.memory)
     nis = update_kernel.update(model.lights, track.state, state, seen, rules)
     if not math.isfinite(nis):
         return None
+    nis *= config.memory  # of the innovation against the covariance of one frame alone
     # a pose of which nothing was known takes up six of the pixels' degrees of freedom
     deviate = deviate_of(nis, 2 * sum(count) - (6 if guess else 0))
     result = FrameResult(assignment, count, plane, nis, deviate)

@@ -13,7 +13,7 @@ from lumidock._kernels.measurements import Measurements
 from lumidock._kernels.tracking.track import PredictedMeasurements
 from lumidock.aiding import NO_AIDING, AidingState
 from lumidock.datatypes import Array, Attitude
-from lumidock.light_counts import CHECKED_LIGHTS
+from lumidock.light_counts import CHECKED_LIGHTS, POSE_LIGHTS
 from lumidock.model import count_lamps
 from lumidock.state import Context, LocalizerState
 from lumidock.track import FrameResult, Track
@@ -57,6 +57,7 @@ def predict(state: LocalizerState, t_ns: int, context: Context) -> Prediction:
     tracks, sensors, deceived = aiding.advance(
         alive, state.aiding, t_ns, context.model, context.config, confirmed=followed
     )
+    tracks = tuple(track.with_stamp_error(one, context.config.track.stamp_s) for one in tracks)
     if not tracks or not followed or not _is_tracked(state, t_ns):
         return Prediction(t_ns, tracks, None, sensors, deceived)
     return Prediction(t_ns, tracks, track.predict_measurements(tracks[0], context.model), sensors)
@@ -71,8 +72,8 @@ def _is_tracked(state: LocalizerState, t_ns: int) -> bool:
 
 def is_frozen(state: LocalizerState, predicted: Prediction, frame: Measurements, context: Context) -> bool:
     """Whether the frame is the picture before again, though the confirmed track moves or that one was frozen too."""
-    before = state.last
-    if before is None or not verify.repeats(frame, before.uv):
+    before, same_picture = state.last, state.digest is not None and state.digest.repeats
+    if before is None or not verify.repeats(frame, before.uv, least=1 if same_picture else POSE_LIGHTS):
         return False
     if state.frozen:
         return True

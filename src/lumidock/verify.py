@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lumidock._kernels.measurements import Measurements
-from lumidock._kernels.tracking.track import CALIBRATION, LIGHTS, TWIST, PredictedMeasurements
+from lumidock._kernels.tracking.track import TWIST, PredictedMeasurements
 from lumidock.config import Config, IntegrityConfig, MatchConfig, TrackConfig
 from lumidock.datatypes import Array, Indices
 from lumidock.light_counts import CHECKED_LIGHTS, JOINT_TRACK_LIGHTS, POSE_LIGHTS
@@ -19,8 +19,6 @@ _REPEATED_SHARE = 0.7  # of the detections that must repeat
 _REPEATED_SIGMAS = 0.15  # rms difference a coordinate of a repeated detection; that of independent noise is sqrt(2)
 _MOVES_M_S, _MOVES_RAD_S = 0.1, 0.02  # faster is not hovering
 _MOVED_SIGMAS = 0.3  # rms a coordinate that the lights are expected to have moved: twice what counts as a repetition
-_TOLD_SHARE = 0.02  # least share of a prior variance that measurements removed; below, linearisation errors dominate
-_CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 
 
 def innovation_holds(track: Track, config: TrackConfig) -> bool:
@@ -60,12 +58,12 @@ def agrees(found: Acquisition, assignment: Indices, config: MatchConfig) -> bool
     return same >= CHECKED_LIGHTS and not contradict(fresh, assignment)
 
 
-def repeats(frame: Measurements, before: Array) -> bool:
-    """Whether a picture is the one `before` again, of centroids (N, 2) px.
+def repeats(frame: Measurements, before: Array, *, least: int) -> bool:
+    """Whether a picture is the one `before` again, of centroids (N, 2) px, by so many of them at `least`.
 
     Noise never repeats: most centroids within a fraction of their sigma come from a camera or decoder that hangs.
     """
-    least = max(POSE_LIGHTS, math.ceil(_REPEATED_SHARE * len(frame.uv)))
+    least = max(least, math.ceil(_REPEATED_SHARE * len(frame.uv)))
     if len(before) == 0 or len(frame.uv) < least:
         return False
     apart = np.linalg.norm(frame.uv[:, None] - before[None], axis=2).min(axis=1) / np.sqrt(frame.var)
@@ -101,24 +99,6 @@ def stands_out(tracks: Sequence[Track], found: Acquisition, config: Config) -> b
     rivals = [other.log_weight for other in tracks[1:] if contradict(assignment, other.last.assignment)]
     against = float(np.logaddexp.reduce([-config.match.log_dock, *rivals]))
     return first.log_weight - against > config.match.margin_gathered
-
-
-def contradicted_file(track: Track, prior_var: Array) -> tuple[str, int]:
-    """What the lights have taught against the files: `calibration` or `survey`, and which state; nothing: ("", -1).
-
-    Of each calibration state the square over the variance that the lights have taken out of its prior (n,), chi-square
-    of one degree of freedom while the files hold (a score test). It counts where they have taken out enough to tell.
-    """
-    if not track.estimates_calibration:
-        return "", -1
-    own = slice(CALIBRATION, len(prior_var))
-    x, var, prior = track.state.x[own], np.diagonal(track.state.P)[own], prior_var[own]
-    told = prior - var
-    test = np.where(told > _TOLD_SHARE * prior, x**2 / np.maximum(told, 1e-300), 0.0)
-    worst = int(test.argmax())
-    if test[worst] < _CONTRADICTION:
-        return "", -1
-    return ("calibration" if worst < LIGHTS - CALIBRATION else "survey"), worst + CALIBRATION
 
 
 def contradict(a: Indices, b: Indices) -> bool:

@@ -22,6 +22,14 @@ from lumidock.streams.sensors import AidingFeed, SensorFeed
 from lumidock.streams.source import Item, Source
 
 
+@dataclass(frozen=True, slots=True)
+class Contradicted:
+    """In how many `frames` one thing in a file was contradicted, and the last of them in words."""
+
+    frames: int
+    text: str
+
+
 @dataclass(slots=True)
 class Summary:
     """Counts of a run, as they stand in run.json."""
@@ -36,6 +44,7 @@ class Summary:
     reason: Counter[str] = field(default_factory=Counter)
     nis: list[float] = field(default_factory=list)
     latency_us: list[int] = field(default_factory=list)
+    contradictions: dict[tuple[str, str], Contradicted] = field(default_factory=dict)
     first_error: str = ""
     finished: bool = False
 
@@ -50,6 +59,10 @@ class Summary:
         self.stage[fix.stage] += fix.valid
         self.reason[fix.reason] += bool(fix.reason)
         self.first_error = self.first_error or error
+        if (against := fix.contradiction) is not None:
+            key = against.file, against.subject
+            before = self.contradictions.get(key)
+            self.contradictions[key] = Contradicted(before.frames + 1 if before else 1, against.text)
         if math.isfinite(fix.nis):
             self.nis.append(fix.nis)
         if latency_us is not None:
@@ -68,10 +81,21 @@ class Summary:
             "status": dict(self.status),
             "valid_by_stage": {name: count for name, count in self.stage.items() if count},
             "reason": {name: count for name, count in self.reason.items() if count},
+            "contradictions": [
+                {"file": file, "subject": subject, "frames": one.frames, "text": one.text}
+                for (file, subject), one in sorted(self.contradictions.items(), key=lambda item: -item[1].frames)
+            ],
             "nis": {"frames": len(self.nis), "mean": sum(self.nis) / len(self.nis)} if self.nis else None,
             "latency_us": latency,
             "finished": self.finished,
         }
+
+
+def contradictions_in_words(counts: dict[str, Any], most: int = 3) -> list[str]:
+    """A sentence for each thing in the files that a run's `counts` say was contradicted, those of most frames first."""
+    found = counts.get("contradictions", [])
+    more = [f"{len(found) - most} further contradictions are in run.json"] if len(found) > most else []
+    return [f"{one['text']} ({one['file']}, {one['frames']} frames)" for one in found[:most]] + more
 
 
 @dataclass(frozen=True, slots=True)

@@ -259,6 +259,7 @@ class Server:
     arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
     latency_us: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
     last: Fix | None = None
+    contradiction: str = ""
     feed: SensorFeed = field(default_factory=lambda: AidingFeed(()))
     started_s: float = field(default_factory=time.monotonic)
 
@@ -298,6 +299,8 @@ class Server:
         self.counts.update(frames=1, valid=int(fix.valid), guide=int(fix.guide is not None))
         if fix.reason:
             self.reasons[fix.reason] += 1
+        if fix.contradiction is not None:
+            self.contradiction = fix.contradiction.text
         self.last = fix
         return fix.stage
 
@@ -322,6 +325,7 @@ class Server:
                 **{word: self.counts[word] for word in ("frames", "valid", "guide")},
                 "reasons": dict(self.reasons),
                 "last": None if last is None else {"status": last.status, "stage": last.stage, "reason": last.reason},
+                "contradiction": self.contradiction,
                 "latency_ms": percentiles([us / 1000.0 for us in list(self.latency_us)]),
             },
             "sinks": {

@@ -231,7 +231,10 @@ def _require_another_folder(out: Path, source: Path) -> None:
 
 
 def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:
-    """The counts of a run, for people or as JSON."""
+    """The counts of a run, for people or as JSON; what contradicts the files in words, beside them."""
+    from lumidock.app.run import contradictions_in_words
+
+    tell(contradictions_in_words(counts))
     if as_json:
         print(json.dumps(counts, indent=2))
         return
@@ -293,9 +296,12 @@ def _sim(
     print(json.dumps({"frames": frames, "folder": str(out)}) if as_json else f"{frames} frames written to {out}")
 
 
-@app.command("campaign", epilog=example("lumidock campaign nominal --seeds 0:100 --out CAMPAIGN"))
+@app.command(
+    "campaign",
+    epilog=example("lumidock campaign nominal --seeds 0:100 --out CAMPAIGN", "lumidock campaign faults --out FAULTS"),
+)
 def _campaign(
-    scenarios: Annotated[list[str], typer.Argument(metavar="SCENARIO", help=f"{SCENARIOS}, or .yaml files.")],
+    scenarios: Annotated[list[str], typer.Argument(metavar="SCENARIO", help=f"{SCENARIOS}, faults, or .yaml files.")],
     out: Annotated[
         Path,
         typer.Option(
@@ -323,15 +329,15 @@ def _campaign(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run scenarios x seeds x methods on bare detections, and count."""
+    """Run scenarios x seeds x methods on bare detections, and count; `faults` stands for every shipped fault."""
     from lumidock.evaluation.campaign import plan, prepare, run_campaign, tabulate
     from lumidock.evaluation.campaign_table import markdown
-    from lumidock.sim.scenario import load_scenario
+    from lumidock.sim.scenario import load_scenarios
 
     for method in methods or ():
         require_method(method)
     campaign = plan(
-        [load_scenario(name, tuple(settings or ())) for name in scenarios],
+        load_scenarios(scenarios, tuple(settings or ())),
         methods or METHODS[:1],
         _seeds(seeds),
         shipped_or_path("station", station) if station else None,

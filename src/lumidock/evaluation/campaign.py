@@ -137,9 +137,10 @@ def plan(
     inputs = {path.name: _digest(path.read_bytes()) for path in (*stations, camera_file)}
     shared = {"lumidock": f"{version('lumidock')}+{source_digest()}", "inputs": inputs, "cold": cold, "bound": bound}
     shards = []
-    unique = {scenario.model_dump_json(): path for scenario, path in zip(scenarios, stations, strict=True)}
-    for scenario, path in unique.items():
-        parsed, station = Scenario.model_validate_json(scenario), load_station(path)
+    pairs = zip(scenarios, stations, strict=True)
+    unique = {scenario.model_dump_json(): (scenario, path) for scenario, path in pairs}
+    for scenario, (parsed, path) in unique.items():
+        station = load_station(path)
         own_inputs = {name: inputs[name] for name in (path.name, camera_file.name)}
         config = validate(Config, parsed.config, f"{parsed.name}: config")
         for method in dict.fromkeys(methods):
@@ -336,6 +337,11 @@ def write_whole(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
+def _described(scenario: Scenario) -> dict[str, Any]:
+    """What a row says of its scenario."""
+    return {"scenario": scenario.name, "assumptions": scenario.assumptions, "says": scenario.says}
+
+
 def tabulate(campaign: Campaign, out: Path) -> dict[str, Any]:
     """Add up all shards in their order, and write table.json and table.md. Raises: LumidockError for a missing one."""
     tallies: dict[tuple[str, str], Tally] = {}
@@ -345,8 +351,8 @@ def tabulate(campaign: Campaign, out: Path) -> dict[str, Any]:
             raise LumidockError(f"{out / 'shards' / shard.file}: is not there")
         place = (shard.scenario.model_dump_json(), shard.method)
         tallies.setdefault(place, Tally()).merge(Tally.from_dict(content["tally"]))
-    names = {shard.scenario.model_dump_json(): shard.scenario.name for shard in campaign.shards}
-    rows = [{"scenario": names[key], "method": method} | row_of(tally) for (key, method), tally in tallies.items()]
+    scenarios = {shard.scenario.model_dump_json(): shard.scenario for shard in campaign.shards}
+    rows = [_described(scenarios[key]) | {"method": method} | row_of(tally) for (key, method), tally in tallies.items()]
     table = {name: campaign.identity[name] for name in ("lumidock", "inputs", "cold", "seeds")} | {"rows": rows}
     write_whole(out / "table.json", json.dumps(table, indent=1))
     write_whole(out / "table.md", markdown(table))

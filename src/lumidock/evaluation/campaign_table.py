@@ -11,6 +11,7 @@ from lumidock.evaluation.claims import GUIDE_ERRORS, POSE_ERRORS
 from lumidock.evaluation.counts import Tally
 
 _DEG = 180.0 / np.pi
+_MOST_REASONS = 3
 
 
 def row_of(tally: Tally) -> dict[str, Any]:
@@ -48,12 +49,24 @@ def _mean(frames: float, total: float) -> dict[str, float | None]:
 
 def markdown(table: dict[str, Any]) -> str:
     """The table for people: availability and identities, integrity, errors, protection levels, and gaps."""
+    faults = [row for row in table["rows"] if row.get("assumptions")]
     parts = [
         f"Seeds {table['seeds'][0]} to {table['seeds'][1] - 1}{', every frame without history' * table['cold']}; "
         f"lumidock {table['lumidock']}.",
+        *([fault_table(faults)] if faults else []),
         *(_section(title, columns, table["rows"]) for title, columns in _SECTIONS.items()),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def fault_table(rows: list[dict[str, Any]]) -> str:
+    """What becomes of each fault: the table of a campaign of scenarios that say whether they keep the assumptions."""
+    order = {side: k for k, side in enumerate(("inside", "edge", "outside"))}
+    lines = [f"| fault | {' | '.join(_FAULTS)} |", "|---|" + "---|" * len(_FAULTS)]
+    for row in sorted(rows, key=lambda row: order[row["assumptions"]]):
+        name = row["scenario"].rpartition("/")[2]
+        lines.append(f"| {name} | {' | '.join(column(row) for column in _FAULTS.values())} |")
+    return "\n".join(lines)
 
 
 def _section(title: str, columns: dict[str, Callable[[dict[str, Any]], str]], rows: list[dict[str, Any]]) -> str:
@@ -119,6 +132,35 @@ def _level(name: str) -> Callable[[dict[str, Any]], str]:
     return lambda row: f"{cells[0](row)} ({cells[1](row)})"
 
 
+def _available(row: dict[str, Any]) -> str:
+    """Share of the frames with four detected lights or more that are valid, %."""
+    valid, among = (sum(row["counts"].get(f"{word}_{n}", 0) for n in ("some", "full")) for word in ("valid", "frames"))
+    return f"{100.0 * valid / among:.1f}" if among else "-"
+
+
+def _says(row: dict[str, Any]) -> str:
+    """The commonest reasons for frames without a valid pose, with their shares of all frames, %."""
+    counts, prefix = row["counts"], "reason "
+    reasons = {key.removeprefix(prefix): n for key, n in counts.items() if key.startswith(prefix)}
+    common = sorted(reasons, key=lambda word: -reasons[word])[:_MOST_REASONS]
+    return ", ".join(f"{word} {100.0 * reasons[word] / counts['frames']:.0f}" for word in common)
+
+
+def _told(row: dict[str, Any]) -> str:
+    return _of("runs_over_said", "runs_over_level")(row) if row.get("says") else "-"
+
+
+_FAULTS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "assumptions": lambda row: str(row["assumptions"]),
+    "frames": _count("frames"),
+    "valid": _count("valid"),
+    "misleading": _count("hazardous_valid"),
+    "misleading guide": _count("hazardous_guide"),
+    "over level": _count("over_level"),
+    "available, %": _available,
+    "no valid pose because, %": _says,
+    "runs over a level that name the file": _told,
+}
 _ERRORS = {
     "lateral, m": "lateral_m",
     "axial, m": "axial_m",

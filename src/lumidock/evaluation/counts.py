@@ -194,9 +194,16 @@ def _judge_poses(tally: Tally, run: SimulatedRun) -> None:
     over = errors > claims.limits()
     tally.add(hazardous_valid=over.any(axis=1).sum())
     tally.add(**{f"hazardous_{name}": which.sum() for name, which in zip(POSE_ERRORS, over.T, strict=True)})
+    _count_over(tally, run, int((errors > levels).any(axis=1).sum()))
     for name, error, level in zip(POSE_ERRORS, errors.T, levels.T, strict=True):
         _spread_error(tally, name, error, level)
     _count_nees(tally, run, [frame.sequence for frame, _ in chosen], claims)
+
+
+def _count_over(tally: Tally, run: SimulatedRun, over: int) -> None:
+    """So many valid poses are over one of their levels; runs with any, and those that say what is wrong."""
+    said = any(fix.reason == run.scenario.says for fix in run.fixes)
+    tally.add(over_level=over, runs_over_level=over > 0, runs_over_said=over > 0 and said)
 
 
 def _spread_error(tally: Tally, name: str, error: Array, level: Array) -> None:

@@ -23,7 +23,7 @@ from lumidock.datatypes import Array, Indices
 from lumidock.geometry import se3_inverse
 from lumidock.integrity import fault_factors
 from lumidock.light_counts import CHECKED_LIGHTS, LAYER_LIGHTS
-from lumidock.model import attitude_prior, station_model
+from lumidock.model import attitude_prior, believed, station_model
 from lumidock.pose import project_lights
 from lumidock.station import Station
 
@@ -37,7 +37,7 @@ class Bound:
         self.station, self.camera, self.config, self.cold = station, camera, config, cold
         self._model = station_model(station, camera, config.match)
         self._prior = attitude_prior(None, config.prior)
-        self._declared = track.calibration_prior(station, None)
+        self._declared = track.calibration_prior(believed(station, config.files), None)
         self._no_planes = np.full_like(self._model.planes, np.nan)  # the true tilt is known
         self.forget()
 

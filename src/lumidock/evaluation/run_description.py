@@ -44,3 +44,12 @@ def mean_nis(description: Mapping[str, Any]) -> dict[str, float] | None:
         return None if nis is None else {"frames": int(nis["frames"]), "mean": float(nis["mean"])}
     except (KeyError, TypeError, ValueError):
         return None
+
+
+def contradictions(description: Mapping[str, Any]) -> list[tuple[str, str, int]]:
+    """What the lights said against the files: the sentence, the reason and the frames; empty where none are noted."""
+    try:
+        found = description["counts"]["contradictions"]
+        return [(str(one["text"]), str(one["file"]), int(one["frames"])) for one in found]
+    except (KeyError, TypeError, ValueError):
+        return []

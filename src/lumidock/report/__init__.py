@@ -10,7 +10,7 @@ from lumidock.errors import InputError
 from lumidock.evaluation.run_folders import find_runs
 from lumidock.report import figures, page, tables
 from lumidock.report.moments import annotated_images
-from lumidock.report.page import PageSection
+from lumidock.report.page import PageSection, Table
 from lumidock.report.view import RunView, load_run
 
 _MOST_RUNS, _MOST_IN_FULL = 12, 3
@@ -55,7 +55,7 @@ def sections_of(view: RunView, prefix: str, *, alone: bool, most_images: int | N
     path = [found[name] for name in ("trajectory",) if name in found]
     errors = [found[name] for name in ("levels", "guide", "stanford") if name in found]
     judged = [table for table in (tables.by_range(view), tables.integrity(view)) if table is not None]
-    why = [table for table in (tables.reasons(view), tables.handover(view)) if table is not None]
+    why = _why(view)
     sections = [PageSection(f"Result{of}", tiles=tables.tiles(view), items=[*shown[:1], *path])]
     if shown:
         sections[0] = replace(sections[0], text=_legend(view))
@@ -67,6 +67,12 @@ def sections_of(view: RunView, prefix: str, *, alone: bool, most_images: int | N
     latency = [found[name] for name in ("latency",) if name in found]
     sections.append(PageSection(f"Time and settings{of}", items=[*latency, *tables.versions(view)]))
     return sections
+
+
+def _why(view: RunView) -> list[Table]:
+    """Tables of what kept frames from being valid, and of the stages."""
+    found = (tables.reasons(view), tables.contradictions(view), tables.handover(view))
+    return [table for table in found if table is not None]
 
 
 def _legend(view: RunView) -> str:
@@ -82,7 +88,7 @@ def _legend(view: RunView) -> str:
 def _in_brief(view: RunView, prefix: str) -> PageSection:
     """One run of many: its numbers, its trajectory and its reasons; the rest is on the page of that run alone."""
     path = [figures.trajectory(view, prefix, _POINTS_IN_BRIEF)] if view.valid.any() else []
-    why = [table for table in (tables.reasons(view), tables.handover(view)) if table is not None]
+    why = _why(view)
     return PageSection(view.name, tiles=tables.tiles(view), items=[*path, *why])
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 
 from lumidock.config import Config
+from lumidock.evaluation import run_description
 from lumidock.report.page import Listing, Table, Tile
 from lumidock.report.view import STAGES, RunView
 
@@ -84,6 +85,14 @@ def reasons(view: RunView) -> Table | None:
     ]
     head = ["reason", "frames", "with bearing and range", "what it means", "longest stretch"]
     return Table("Why there was no valid pose.", head, rows)
+
+
+def contradictions(view: RunView) -> Table | None:
+    """What was seen against the station and the camera file."""
+    rows = [[text, reason, str(frames)] for text, reason, frames in run_description.contradictions(view.described)]
+    if not rows:
+        return None
+    return Table("What the lights say against the files.", ["last seen", "reason", "frames"], rows)
 
 
 def _longest(view: RunView, word: str) -> str:

@@ -6,7 +6,7 @@ Shapes: N frames, G runs, M lights, S detections.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -18,8 +18,32 @@ from lumidock.pose import project_lights
 from lumidock.sim.aiding import sensor_values
 from lumidock.sim.course import Course, course_of, mirror_image, project_each, shines
 from lumidock.sim.draws import Draw
-from lumidock.sim.measured import Appearance, DetectionTable, as_measured, detector_errors, with_false
-from lumidock.sim.point_faults import bent, glints, seen_glints
+from lumidock.sim.fault_knobs import PointFaults
+from lumidock.sim.fault_motion import arriving, moved, stamps_ns
+from lumidock.sim.measured import (
+    Appearance,
+    DetectionTable,
+    DetectorErrors,
+    as_measured,
+    detector_errors,
+    with_false,
+)
+from lumidock.sim.point_faults import (
+    Extras,
+    LensFaults,
+    bent,
+    dead_lamps,
+    faulty_noise,
+    glints,
+    lamp_faults,
+    lens_faults,
+    missurveyed,
+    no_lens_faults,
+    none_of,
+    outliers,
+    seen_extras,
+    some_time,
+)
 from lumidock.sim.scenario import BlackOuts, Scenario, rotations, spurious_paths
 from lumidock.station import Station
 
@@ -81,45 +105,39 @@ def dark_lights(scenario: Scenario, front_in_view: Indices, rng: np.random.Gener
     return np.asarray(rng.choice(front_in_view, count, replace=False)) if count else np.empty(0, np.int64)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Runs:
+    """All that is drawn of a scenario's runs before anything is seen; `errors`: those of a measured detector."""
+
+    scenario: Scenario
+    station: Station
+    camera: Camera
+    course: Course
+    drawn: RunDraws
+    off: np.ndarray
+    extras: Extras
+    lens: LensFaults
+    errors: DetectorErrors | None
+
+
 def simulated_frames(scenario: Scenario, station: Station, camera: Camera, seed: int) -> Iterator[SimulatedFrame]:
     """All frames of a scenario as bare detections; in each frame lights come first, in the order of the station.
 
     Raises: InputError when no pose has the front layer in view.
     """
-    course = course_of(scenario, station, camera, np.random.default_rng([seed, Draw.COURSE]))
-    drawn = run_draws(scenario, station, course, np.random.default_rng([seed, Draw.RUN]))
-    bent_p = bent(scenario.detections, drawn.p_dock, np.random.default_rng([seed, Draw.BENT_LIGHT]))
-    drawn = replace(drawn, p_dock=bent_p)
-    places = glints(scenario.detections, drawn.p_dock, drawn.dead, np.random.default_rng([seed, Draw.STRUCTURE_GLINTS]))
+    run = _drawn(scenario, station, camera, seed)
+    course, faults = run.course, scenario.detections.faults
+    rng, detector_rng = (np.random.default_rng([seed, purpose]) for purpose in (Draw.DETECTIONS, Draw.DETECTOR_ERRORS))
     wander = _wandering(scenario, camera, course, np.random.default_rng([seed, Draw.WANDERING_LIGHTS]))
-    rng = np.random.default_rng([seed, Draw.DETECTIONS])
-    uv, visible, range_m = _in_view_of_each(scenario, station, camera, course, drawn)
-    lit = visible & ~_dark(scenario, station, course, drawn, visible, rng)
-    spurious = _spurious(scenario, drawn, wander, _box(scenario, camera, uv, visible), rng)
-    fixed = seen_glints(scenario.detections, camera, course, places, drawn.black)
-    spurious = np.concatenate([spurious[0], fixed[0]]), np.concatenate([spurious[1], fixed[1]])
-    errors = detector_errors(scenario.detections.detector) if scenario.detections.detector else None
-    detector_rng = np.random.default_rng([seed, Draw.DETECTOR_ERRORS])
-    if errors:
-        lit &= errors.found(_is_rear(station), range_m, detector_rng)
-    table = _table(uv, lit, spurious, range_m, scenario.shows_dock)
-    if errors:
-        dock_m = np.linalg.norm(course.T_dock_cam[:, :3, 3], axis=1)
-        table = with_false(table, errors, np.where(drawn.black, np.nan, dock_m), camera, detector_rng)
+    table, visible, uv = _detected(run, wander, rng, detector_rng)
     attitudes = _attitudes(scenario, course, np.random.default_rng([seed, Draw.ATTITUDE]))
-    if not scenario.shows_dock:
-        uv, visible = _pixels_of_hidden_dock(scenario, camera, course, drawn, uv), np.zeros_like(visible)
-    noise = rng.normal(0.0, 1.0, table.uv.shape) * scenario.detections.noise_px
-    sure, p_rear = np.ones(len(noise)), _p_rear(scenario, station, table.light, rng)
-    appearance = Appearance(noise, None, sure, p_rear)
-    if errors:
-        appearance = as_measured(
-            errors, appearance, table, _is_rear(station), scenario.detections.noise_px, detector_rng
-        )
-    detections = _detections(course, table, appearance, attitudes)
-    bounds, aiding = _bounds(course, table), sensor_values(scenario, course, seed)
-    for number, (frame, (a, b)) in enumerate(zip(detections, pairwise(bounds), strict=True)):
-        yield SimulatedFrame(
+    aiding = sensor_values(scenario, course, seed)
+    stream_rng = np.random.default_rng([seed, Draw.POINT_STREAM])
+    appearance = _appearance(run, table, rng, detector_rng, np.random.default_rng([seed, Draw.POINT_NOISE]))
+    stamped = replace(course, t_ns=stamps_ns(course, faults, stream_rng))
+    detections = _detections(stamped, table, appearance, attitudes)
+    frames = [
+        SimulatedFrame(
             frame,
             course.T_dock_cam[number],
             table.light[a:b],
@@ -129,6 +147,94 @@ def simulated_frames(scenario: Scenario, station: Station, camera: Camera, seed:
             step=int(course.step[number]),
             aiding=aiding[number],
         )
+        for number, (frame, (a, b)) in enumerate(zip(detections, pairwise(_bounds(course, table)), strict=True))
+    ]
+    yield from _delivered(frames, course.t_ns * 1e-9, faults, stream_rng)
+
+
+def _drawn(scenario: Scenario, station: Station, camera: Camera, seed: int) -> _Runs:
+    """Draw the runs of a scenario."""
+    knobs, rear = scenario.detections, _is_rear(station)
+    faults, rng = knobs.faults, np.random.default_rng([seed, Draw.POINT_FAULTS])
+    course = course_of(scenario, station, camera, np.random.default_rng([seed, Draw.COURSE]))
+    drawn = run_draws(scenario, station, course, np.random.default_rng([seed, Draw.RUN]))
+    p_dock = bent(knobs, drawn.p_dock, np.random.default_rng([seed, Draw.BENT_LIGHT]))
+    lamps, lens = none_of(course, rear), no_lens_faults(len(course.t_ns))
+    if faults.any:
+        course = moved(course, faults, rng)
+        p_dock = missurveyed(faults, station, p_dock, rng)
+        drawn = replace(drawn, dead=dead_lamps(faults, rear, drawn.dead, rng))
+        lamps = lamp_faults(knobs, rear, p_dock, course, rng)
+        lens = lens_faults(faults, course.t_ns * 1e-9, rng)
+    fixed = glints(knobs, p_dock, course, drawn.dead, rear, rng=np.random.default_rng([seed, Draw.STRUCTURE_GLINTS]))
+    return _Runs(
+        scenario,
+        station,
+        camera,
+        course,
+        replace(drawn, p_dock=p_dock),
+        off=lamps.off,
+        extras=Extras.together([fixed, lamps.extras]),
+        lens=lens,
+        errors=detector_errors(knobs.detector) if knobs.detector else None,
+    )
+
+
+def _detected(
+    run: _Runs, wander: Array, rng: np.random.Generator, detector_rng: np.random.Generator
+) -> tuple[DetectionTable, np.ndarray, Array]:
+    """Detections of all frames; which lights (N, M) are visible, and their true pixels (N, M, 2)."""
+    scenario, camera, drawn = run.scenario, run.camera, run.drawn
+    uv, visible, range_m = _in_view_of_each(run)
+    lit = visible & ~_dark(scenario, run.station, run.course, drawn, visible, rng) & ~run.off
+    spurious = _spurious(scenario, drawn, wander, _box(scenario, camera, uv, visible), rng)
+    fixed = seen_extras(scenario.detections, camera, run.course, run.extras, run.lens, black=drawn.black)
+    if run.errors:
+        lit &= run.errors.found(_is_rear(run.station), range_m, detector_rng)
+    table = _table(run, uv, lit, spurious, fixed, range_m)
+    if run.errors:
+        dock_m = np.linalg.norm(run.course.T_dock_cam[:, :3, 3], axis=1)
+        table = with_false(table, run.errors, np.where(drawn.black, np.nan, dock_m), camera, detector_rng)
+    if scenario.shows_dock:
+        return table, visible, uv
+    return table, np.zeros_like(visible), _pixels_of_hidden_dock(run, uv)
+
+
+def _appearance(
+    run: _Runs,
+    table: DetectionTable,
+    rng: np.random.Generator,
+    detector_rng: np.random.Generator,
+    fault_rng: np.random.Generator,
+) -> Appearance:
+    """Errors and weights of all detections."""
+    knobs, t_s = run.scenario.detections, run.course.t_ns * 1e-9
+    noise = rng.normal(0.0, 1.0, table.uv.shape)
+    off_px = faulty_noise(knobs.faults, noise, table.frame, table.light, t_s, rng=fault_rng) * knobs.noise_px
+    off_px += outliers(knobs.faults, len(noise), fault_rng)
+    appearance = Appearance(off_px, None, np.ones(len(noise)), _p_rear(run.scenario, table, rng))
+    if not run.errors:
+        return appearance
+    return as_measured(run.errors, appearance, table, _is_rear(run.station), knobs.noise_px, rng=detector_rng)
+
+
+def _delivered(
+    frames: Sequence[SimulatedFrame], t_s: Array, faults: PointFaults, rng: np.random.Generator
+) -> Iterator[SimulatedFrame]:
+    """The frames that arrive; while the picture is frozen the detections of the first such frame again and again."""
+    arrives, frozen, held = arriving(t_s, faults, rng), some_time(rng, t_s, rng.uniform(*faults.frozen_s)), None
+    for frame, comes, repeats in zip(frames, arrives, frozen, strict=True):
+        if not repeats:
+            held = None
+        elif held is None:
+            held = frame
+        else:
+            d = held.detections
+            uv = d.uv + rng.normal(size=d.uv.shape) * faults.frozen_px
+            again = replace(d, frame=frame.detections.frame, t_ns=frame.detections.t_ns, uv=uv)
+            frame = replace(frame, detections=again, light=held.light)
+        if comes:
+            yield frame
 
 
 def run_draws(scenario: Scenario, station: Station, course: Course, rng: np.random.Generator) -> RunDraws:
@@ -166,15 +272,14 @@ def _black(knobs: BlackOuts, t_s: Array, rng: np.random.Generator) -> np.ndarray
     return black
 
 
-def _in_view_of_each(
-    scenario: Scenario, station: Station, camera: Camera, course: Course, drawn: RunDraws
-) -> tuple[Array, np.ndarray, Array]:
+def _in_view_of_each(run: _Runs) -> tuple[Array, np.ndarray, Array]:
     """True pixels (N, M, 2) of all lights or of their mirror images, which (N, M) are in view, and ranges (N, M) m."""
+    scenario, station, camera, course, drawn = run.scenario, run.station, run.camera, run.course, run.drawn
     p_dock = drawn.p_dock[course.run]
     if scenario.detections.mirror == "only":
         p_dock = mirror_image(p_dock, course.surface_m[course.run])
     uv, p_cam = project_each(camera, course.T_dock_cam, p_dock)
-    uv = _through_lens(camera, course, drawn, uv)
+    uv = _through_lens(run, uv)
     range_m = np.linalg.norm(p_cam, axis=2)
     seen = camera.contains(uv) & (range_m < drawn.reach_m[course.run]) & shown_layers(scenario, station)
     shining = shines(station.axis, scenario, course.T_dock_cam, p_dock)
@@ -193,17 +298,20 @@ def failed(scenario: Scenario, station: Station, t_s: Array) -> np.ndarray:
     return np.asarray(t_s[:, None] >= end_s)
 
 
-def _through_lens(camera: Camera, course: Course, drawn: RunDraws, uv: Array) -> Array:
+def _through_lens(run: _Runs, uv: Array) -> Array:
     """Pixels (N, M, 2) through the true lens, from the pixels `uv` (N, M, 2) through the calibrated camera."""
+    camera, course, drawn = run.camera, run.course, run.drawn
     scale = 1.0 + drawn.focal[course.run, None, None]
-    return np.asarray((uv - camera.center_px) * scale + camera.center_px + drawn.center_px[course.run, None])
+    through = (uv - camera.center_px) * scale + camera.center_px + drawn.center_px[course.run, None]
+    return run.lens.distorted(camera, np.asarray(through))
 
 
-def _pixels_of_hidden_dock(scenario: Scenario, camera: Camera, course: Course, drawn: RunDraws, uv: Array) -> Array:
+def _pixels_of_hidden_dock(run: _Runs, uv: Array) -> Array:
     """True pixels (N, M, 2) of the lights of a dock that the picture does not show; NaN when there is no dock."""
-    if not scenario.detections.dock:
+    if not run.scenario.detections.dock:
         return np.full_like(uv, np.nan)
-    return _through_lens(camera, course, drawn, project_each(camera, course.T_dock_cam, drawn.p_dock[course.run])[0])
+    course = run.course
+    return _through_lens(run, project_each(run.camera, course.T_dock_cam, run.drawn.p_dock[course.run])[0])
 
 
 def _dark(
@@ -268,16 +376,24 @@ def _spurious(
 
 
 def _table(
-    uv: Array, lit: np.ndarray, spurious: tuple[Indices, Array], range_m: Array, dock_is_shown: bool
+    run: _Runs,
+    uv: Array,
+    lit: np.ndarray,
+    spurious: tuple[Indices, Array],
+    fixed: tuple[Indices, Array, np.ndarray],
+    range_m: Array,
 ) -> DetectionTable:
     """Table of all lit lights and spurious detections, frame by frame; without the dock no detection has a light."""
     frame, light = np.nonzero(lit)
-    seen, nothing = np.concatenate([uv[frame, light], spurious[1]]), np.full(len(spurious[0]), -1)
-    far = np.concatenate([range_m[frame, light] if dock_is_shown else np.full(len(light), np.nan), nothing * np.nan])
-    light = np.concatenate([light if dock_is_shown else np.full(len(light), -1), nothing])
-    frame = np.concatenate([frame, spurious[0]])
+    shown, more = run.scenario.shows_dock, len(spurious[0]) + len(fixed[0])
+    far = np.concatenate([range_m[frame, light] if shown else np.full(len(light), np.nan), np.full(more, np.nan)])
+    looks_rear = _is_rear(run.station)[light] if shown else np.zeros(len(light), bool)
+    rear = np.concatenate([looks_rear, np.zeros(len(spurious[0]), bool), fixed[2]])
+    light = np.concatenate([light if shown else np.full(len(light), -1), np.full(more, -1)])
+    frame = np.concatenate([frame, spurious[0], fixed[0]])
     order = np.argsort(frame, kind="stable")
-    return DetectionTable(frame[order], seen[order], light[order], far[order])
+    seen = np.concatenate([uv[lit], spurious[1], fixed[1]])
+    return DetectionTable(frame[order], seen[order], light[order], far[order], rear[order])
 
 
 def _is_rear(station: Station) -> np.ndarray:
@@ -285,12 +401,10 @@ def _is_rear(station: Station) -> np.ndarray:
     return np.asarray(station.layer != station.layers.index(station.layers_front_to_rear()[0]))
 
 
-def _p_rear(scenario: Scenario, station: Station, light: Indices, rng: np.random.Generator) -> Array:
-    """Probability (S,) that a detection is of the rear layer; spurious ones start as front, `wrong_layer` flips any."""
-    front = station.layers.index(station.layers_front_to_rear()[0])
-    rear = (light >= 0) & (station.layer[light] != front)
-    rear ^= rng.random(len(light)) < scenario.detections.wrong_layer
-    return np.where(rear, _P_REAR[1], _P_REAR[0]) if scenario.detections.color else np.full(len(light), np.nan)
+def _p_rear(scenario: Scenario, table: DetectionTable, rng: np.random.Generator) -> Array:
+    """Probability (S,) that a detection is of the rear layer; `wrong_layer` flips any."""
+    rear = table.rear ^ (rng.random(len(table.rear)) < scenario.detections.wrong_layer)
+    return np.where(rear, _P_REAR[1], _P_REAR[0]) if scenario.detections.color else np.full(len(rear), np.nan)
 
 
 def _attitudes(scenario: Scenario, course: Course, rng: np.random.Generator) -> list[Attitude | None]:

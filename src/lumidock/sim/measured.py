@@ -30,13 +30,14 @@ class DetectionTable:
 
     The number `frame` (S,) of the frame, true pixels `uv` (S, 2), the index `light` (S,) of the light, -1 for none, and
     the range of that light, `range_m` (S,) m. For a false detection of the detector it is the range of the dock, for a
-    spurious light of the scenario NaN.
+    spurious light of the scenario NaN. `rear` (S,): whether it looks like a light of a rear layer.
     """
 
     frame: Indices
     uv: Array
     light: Indices
     range_m: Array
+    rear: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,7 +151,9 @@ def with_false(
     order = np.argsort(frame, kind="stable")
     light = np.concatenate([detections.light, np.full(len(false), -1)])
     range_m = np.concatenate([detections.range_m, dock_m[false]])
-    return DetectionTable(frame[order], np.concatenate([detections.uv, uv])[order], light[order], range_m[order])
+    rear = np.concatenate([detections.rear, np.zeros(len(false), bool)])
+    seen = np.concatenate([detections.uv, uv])
+    return DetectionTable(frame[order], seen[order], light[order], range_m[order], rear[order])
 
 
 def as_measured(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,6 +14,7 @@ from typing_extensions import Self
 
 from lumidock.datatypes import Array
 from lumidock.errors import InputError
+from lumidock.sim.fault_knobs import PointFaults
 from lumidock.sim.knobs import (
     AidingKnobs,
     Angle,
@@ -156,6 +158,7 @@ class DetectionKnobs(KnobSection):
     calibration: bool = False  # whether the lens has errors of the station's calibration_sigma
     black_outs: BlackOuts = BlackOuts()
     attitude: AttitudeSensor | None = None
+    faults: PointFaults = PointFaults()
     aiding: AidingKnobs | None = None
 
 
@@ -178,11 +181,16 @@ class Scenario(KnobSection):
     faults: Faults = Faults()
     detections: DetectionKnobs = DetectionKnobs()
     config: dict[str, Any] = Field(default_factory=dict)  # configuration of the localizer that the scenario needs
+    # of a scenario of faults: whether it lies within the assumptions of the safety case, at their edge, or outside
+    assumptions: Literal["", "inside", "edge", "outside"] = ""
+    says: str = ""  # the reason that has to end the trust in the pose, of a fault outside them that can be told
 
     @model_validator(mode="after")
-    def _mirror_needs_draws(self) -> Self:
+    def _path_suits(self) -> Self:
         if self.detections.mirror == "only" and self.path.kind != "draws":
             raise ValueError("detections.mirror: only needs a path of draws, whose camera is turned up to the surface")
+        if self.detections.faults.any and self.path.kind == "draws":
+            raise ValueError("detections.faults: are those of a run along a path, not of draws")
         return self
 
     @property
@@ -192,9 +200,19 @@ class Scenario(KnobSection):
 
 
 def shipped_scenarios() -> list[str]:
-    """Names of the scenarios that come with the package."""
-    folder = files("lumidock.sim") / "scenarios"
-    return sorted(Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    """Names of the scenarios that come with the package, but for those of faults."""
+    return _names("scenarios")
+
+
+def fault_scenarios() -> list[str]:
+    """Names of the shipped scenarios of faults at point level: `faults/NAME`."""
+    return [f"faults/{name}" for name in _names("scenarios/faults")]
+
+
+def _names(folder: str) -> list[str]:
+    """Names of the scenarios in a folder of the package."""
+    entries = (files("lumidock.sim") / folder).iterdir()
+    return sorted(Path(entry.name).stem for entry in entries if entry.name.endswith(".yaml"))
 
 
 def station_of(scenario: Scenario) -> Path:
@@ -215,7 +233,7 @@ def load_scenario(name: str, settings: tuple[str, ...] = ()) -> Scenario:
 
     Raises: InputError, one line, for an unknown name, key or value.
     """
-    if name in shipped_scenarios():
+    if name in shipped_scenarios() or name in fault_scenarios():
         with as_file(files("lumidock.sim") / "scenarios" / f"{name}.yaml") as path:
             content = read_mapping(path)
     elif Path(name).suffix in (".yaml", ".yml"):
@@ -225,6 +243,12 @@ def load_scenario(name: str, settings: tuple[str, ...] = ()) -> Scenario:
     for setting in settings:
         _apply(content, setting)
     return validate(Scenario, content, name)
+
+
+def load_scenarios(names: Sequence[str], settings: tuple[str, ...] = ()) -> list[Scenario]:
+    """Read scenarios as `load_scenario` does; `faults` stands for all of faults at point level. Raises: InputError."""
+    wanted = [one for name in names for one in (fault_scenarios() if name == "faults" else [name])]
+    return [load_scenario(name, settings) for name in wanted]
 
 
 def _apply(content: dict[str, Any], setting: str) -> None:

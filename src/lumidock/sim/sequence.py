@@ -84,9 +84,11 @@ def render_frame(
 
 
 def require_possible(scenario: Scenario, *, detections: bool = False, video: bool = False) -> None:
-    """Raises: InputError where bare detections cannot be made of a scenario, or a video cannot hold its pictures."""
+    """Raises: InputError where a scenario cannot be made as bare detections, or as pictures, or as a video."""
     if detections and scenario.lens.port is not None:
         raise InputError(f"{scenario.name}: has a flat port, which bare detections do not model; render it")
+    if not detections and scenario.detections.faults.any:
+        raise InputError(f"{scenario.name}: detections.faults are made as bare detections alone; give --detections")
     if video and scenario.output.pixels not in ("bgr8", "mono8"):
         raise InputError(f"output.pixels: a video holds bgr8 or mono8, not {scenario.output.pixels}")
 
