@@ -64,7 +64,7 @@ class Scan:
         self.size_px = 0.0
 
 
-class _Blobs(NamedTuple):
+class Blobs(NamedTuple):
     """Blobs: `rows` (N, columns of `blobs`), U and V px among them, `cov` (N, 2, 2) px^2, `measured` (N, MEASURES)."""
 
     rows: Array
@@ -89,16 +89,17 @@ def seen(frame: Frame, scan: Scan, predicted: Array | None = None) -> Seen | Non
     """The blobs of `lights`, with what is known of each; in px of the frame as `scan` stretches it."""
     image = _squared(in_color(frame), scan.stretch)
     if predicted is None:
-        views = _everywhere(image, scan)
+        views = everywhere(image, scan)
     else:
         views = _windows(image, predicted * [*scan.stretch, scan.stretch.max()], scan)
     if not views:
         return None
     patches = np.concatenate([view.patches for view in views])
-    found = _blobs(views, patches, image.shape, scan.config)
+    maxima = one_per_plane(candidates(views, patches, scan.config), image.shape, scan.config)
+    found = measured(views, patches, maxima, image.shape, scan.config)
     if frame.encoding.startswith("bayer"):
         _widen_sparse(found, scan.config.mosaic_px)
-    best = _one_per_light(found, image.shape, scan.config)
+    best = one_per_light(found, image.shape, scan.config)
     return _described(views, patches, best)
 
 
@@ -127,7 +128,7 @@ def _squared(image: Image, stretch: Array) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR))
 
 
-def _everywhere(image: Image, scan: Scan) -> list[Canvas]:
+def everywhere(image: Image, scan: Scan) -> list[Canvas]:
     """The live tiles at fine levels, and all of the frame at coarse ones."""
     config, (height, width) = scan.config, image.shape[:2]
     whole = np.array([[0, 0, width, height]], np.int64)
@@ -192,8 +193,8 @@ def _blur(image: Array, sigma: float) -> Array:
     return np.asarray(out.reshape(image.shape))
 
 
-def _blobs(views: list[Canvas], patches: Indices, shape: tuple[int, ...], config: DetectConfig) -> _Blobs:
-    """Maxima over all planes, scales and levels, with their centroids."""
+def candidates(views: list[Canvas], patches: Indices, config: DetectConfig) -> Array:
+    """Maxima (N, columns of `blobs`) over all planes, scales and levels."""
     found, count, first = np.empty((config.max_blobs, blobs.COLUMNS)), 0, 0
     for view in views:
         last = first + len(view.patches)
@@ -226,12 +227,16 @@ def _blobs(views: list[Canvas], patches: Indices, shape: tuple[int, ...], config
                 )
                 fine = wide
         first = last
-    rows = found[:count]
+    return found[:count]
+
+
+def one_per_plane(rows: Array, shape: tuple[int, ...], config: DetectConfig) -> Array:
+    """Those of the maxima that stand for themselves in their own plane, the strongest first."""
     order = np.argsort(-rows[:, blobs.HEIGHT], kind="stable")
-    kept = np.ones(count)
+    kept = np.ones(len(rows))
     edge, limits = _edge(rows, shape).min(axis=1), (config.reach, config.wide, config.texture)
     groups.strongest(rows, edge, order, *limits, kept)
-    return _measured(views, patches, rows[order[kept[order] > 0.0]], shape, config)
+    return np.asarray(rows[order[kept[order] > 0.0]])
 
 
 def _noise(sampled: Array, least: float) -> Array:
@@ -257,17 +262,17 @@ def _edge(rows: Array, shape: tuple[int, ...]) -> Array:
     return np.asarray(np.minimum(at, (shape[1], shape[0]) - at))
 
 
-def _measured(
+def measured(
     views: list[Canvas], patches: Indices, rows: Array, shape: tuple[int, ...], config: DetectConfig
-) -> _Blobs:
+) -> Blobs:
     """Their centroids and covariances; without those that are no maxima of the continuous filter."""
     rows = _finer(views, rows)
     out = np.zeros((len(rows), centroid.MEASURES))
     for view, mine in _by_view(views, rows):
-        part, measured = rows[mine], out[mine]
+        part, its = rows[mine], out[mine]
         for k, image in enumerate(view.levels):
-            centroid.centroids(image, patches, view.base + k, part, measured)
-        out[mine] = measured
+            centroid.centroids(image, patches, view.base + k, part, its)
+        out[mine] = its
     holds = (out[:, centroid.M_OK] == 1.0) & (out[:, centroid.M_HEIGHT] > config.clear * rows[:, blobs.NOISE])
     rows, out = rows[holds], out[holds]
     pixel = 2.0 ** rows[:, blobs.LEVEL]
@@ -279,7 +284,7 @@ def _measured(
     near = np.maximum(_BORDER * rows[:, [blobs.SIZE]] - _edge(rows, shape), 0.0)  # mirrored samples draw it there
     for axis in range(2):
         cov[:, axis, axis] += (config.border_share * near[:, axis]) ** 2
-    return _Blobs(rows, cov, out)
+    return Blobs(rows, cov, out)
 
 
 def _by_view(views: list[Canvas], rows: Array) -> Iterator[tuple[Canvas, NDArray[np.bool_]]]:
@@ -291,7 +296,7 @@ def _by_view(views: list[Canvas], rows: Array) -> Iterator[tuple[Canvas, NDArray
         first = last
 
 
-def _widen_sparse(found: _Blobs, mosaic_px: float) -> None:
+def _widen_sparse(found: Blobs, mosaic_px: float) -> None:
     """Add to the covariance of small blobs in blue and red of a mosaic, of which every fourth pixel is a sample."""
     size, plane = found.rows[:, blobs.SIZE], found.rows[:, blobs.PLANE]
     sparse = np.where((plane == 0.0) | (plane == 2.0), mosaic_px**2 * np.exp(-0.5 * size**2), 0.0)
@@ -325,7 +330,7 @@ def _covariance(rows: Array, out: Array, pixel: Array, config: DetectConfig) -> 
     return np.asarray(cov + rest[:, None, None] * np.eye(2))
 
 
-def _one_per_light(found: _Blobs, shape: tuple[int, ...], config: DetectConfig) -> _Blobs:
+def one_per_light(found: Blobs, shape: tuple[int, ...], config: DetectConfig) -> Blobs:
     """The blob that stands for each light, the strongest first."""
     rows = found.rows
     order = np.argsort(-rows[:, blobs.HEIGHT], kind="stable")
@@ -337,10 +342,10 @@ def _one_per_light(found: _Blobs, shape: tuple[int, ...], config: DetectConfig) 
     uv, cov = _fused(found, best, partner, config)
     rows = rows[best]
     rows[:, [blobs.U, blobs.V]] = uv
-    return _Blobs(rows, cov, found.measured[best])
+    return Blobs(rows, cov, found.measured[best])
 
 
-def _fused(found: _Blobs, best: Indices, partner: Indices, config: DetectConfig) -> tuple[Array, Array]:
+def _fused(found: Blobs, best: Indices, partner: Indices, config: DetectConfig) -> tuple[Array, Array]:
     """Centroids (n, 2) and covariances of lights: of the best blob, or of all planes that show the same core.
 
     The estimates of blue, green and red are weighted by their inverse covariances where they agree with the best one.
@@ -364,7 +369,7 @@ def _fused(found: _Blobs, best: Indices, partner: Indices, config: DetectConfig)
     return uv, cov + config.floor_px**2 * np.eye(2)
 
 
-def _described(views: list[Canvas], patches: Indices, best: _Blobs) -> Seen:
+def _described(views: list[Canvas], patches: Indices, best: Blobs) -> Seen:
     """The same with the rings around them."""
     planes = 4 if views[0].levels[0].shape[2] == 3 else 1
     rings = np.zeros((len(best.rows), 3, planes, profiles.RINGS))
