@@ -39,13 +39,14 @@ def stages(frame: Frame, uv: Array, config: DetectConfig) -> Lost:
     image, scan = in_color(frame), detect.Scan(frame, config)
     views = detect.everywhere(image, scan)
     patches = np.concatenate([view.patches for view in views])
-    rows = detect.candidates(views, patches, config)
+    rows = detect.candidates(views, patches, scan)
     alone = detect.one_per_plane(rows, image.shape, config)
     found = detect.measured(views, patches, alone, image.shape, config)
     seen = detect.seen(frame, scan)
     assert seen is not None
     lamps = seen.rows[lamp.likelihood(seen) > 0.5]
-    kept = [_in_cores(patches, uv)] + [near(part, uv) for part in (rows, alone, found.rows, seen.rows, lamps)]
+    searched = views[-1].patches[: len(views[-1].patches) - views[-1].unsearched]
+    kept = [_in_cores(searched, uv)] + [near(part, uv) for part in (rows, alone, found.rows, seen.rows, lamps)]
     others = np.linalg.norm(lamps[:, None, [blobs.U, blobs.V]] - uv[None], axis=2).min(axis=1, initial=np.inf)
     return Lost(kept, int((others > np.maximum(_NEAR_PX, lamps[:, blobs.SIZE])).sum()))
 
@@ -56,9 +57,8 @@ def near(rows: Array, uv: Array) -> np.ndarray:
     return np.asarray((away < np.maximum(_NEAR_PX, _NEAR_SHARE * rows[:, blobs.SIZE])).any(axis=1))
 
 
-def _in_cores(patches: Indices, uv: Array) -> np.ndarray:
-    """Whether a place lies where the finest level is searched; True everywhere if the coarse levels alone are."""
-    fine = patches[1:] if len(patches) > 1 else patches
+def _in_cores(fine: Indices, uv: Array) -> np.ndarray:
+    """Whether a place (M, 2) lies in the core of a patch."""
     at = uv[:, None] - fine[None, :, [U0, V0]] + fine[None, :, [LEFT, TOP]]
     low, high = fine[:, [CORE_LEFT, CORE_TOP]], fine[:, [CORE_RIGHT, CORE_BOTTOM]]
     return np.asarray(((at >= low - 0.5) & (at < high)).all(axis=2).any(axis=1))

@@ -27,6 +27,7 @@ from lumidock.picture import in_color
 _SCALES = 0.9 * np.sqrt(2.0) ** np.arange(3)  # standard deviations of the Gaussians, pixels of their level
 _TAPS = 3.0  # standard deviations on each side that a filter sums: 0.3 % of a Gaussian is beyond
 _SAMPLES = 1024  # responses whose median absolute value is the noise: known to 4 %
+_SQUARES, _SQUARE_PX = (4, 3), 24  # columns and rows of squares of the frame where noise is measured, and their side
 _SIGMA = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 _ROUNDING = 0.29 * 0.115  # response noise of rounding at scale 1: 1/sqrt(12) grey levels times the filter's gain
 _BORDER = 2.5  # distance from the border, in blob sizes, within which mirrored samples bias the centroid toward it
@@ -62,6 +63,7 @@ class Scan:
         """Drop what the frames before say."""
         self.saturated = SATURATED
         self.size_px = 0.0
+        self.noise: dict[tuple[int, int], Array] = {}  # (P,) of the responses of a level and a scale
 
 
 class Blobs(NamedTuple):
@@ -95,7 +97,9 @@ def seen(frame: Frame, scan: Scan, predicted: Array | None = None) -> Seen | Non
     if not views:
         return None
     patches = np.concatenate([view.patches for view in views])
-    maxima = one_per_plane(candidates(views, patches, scan.config), image.shape, scan.config)
+    if predicted is None:
+        scan.noise = {}
+    maxima = one_per_plane(candidates(views, patches, scan), image.shape, scan.config)
     found = measured(views, patches, maxima, image.shape, scan.config)
     if frame.encoding.startswith("bayer"):
         _widen_sparse(found, scan.config.mosaic_px)
@@ -149,7 +153,18 @@ def everywhere(image: Image, scan: Scan) -> list[Canvas]:
     if area > height * width:
         cores, area = whole, float(height * width)
     base = _base(area, config.full_area_px)
-    return [coarse, canvas(image, 0, cores, margin, (base, _COARSE - 1))]
+    if cores is whole:
+        return [coarse, canvas(image, 0, cores, margin, (base, _COARSE - 1))]
+    squares = _squares(height, width)
+    return [coarse, canvas(image, 0, np.concatenate([cores, squares]), margin, (base, _COARSE - 1), len(squares))]
+
+
+def _squares(height: int, width: int) -> Indices:
+    """Boxes (N, 4) u0, v0, u1, v1 px, spread evenly over a frame: live tiles are full of lamps and tell no noise."""
+    columns, rows = _SQUARES
+    v, u = np.meshgrid(np.arange(rows) + 0.5, np.arange(columns) + 0.5, indexing="ij")
+    low = np.column_stack([u.ravel() * width / columns, v.ravel() * height / rows]).astype(np.int64) - _SQUARE_PX // 2
+    return np.concatenate([low, low + _SQUARE_PX], axis=1)
 
 
 def _base(area: float, most: float) -> int:
@@ -193,12 +208,13 @@ def _blur(image: Array, sigma: float) -> Array:
     return np.asarray(out.reshape(image.shape))
 
 
-def candidates(views: list[Canvas], patches: Indices, config: DetectConfig) -> Array:
+def candidates(views: list[Canvas], patches: Indices, scan: Scan) -> Array:
     """Maxima (N, columns of `blobs`) over all planes, scales and levels."""
+    config = scan.config
     found, count, first = np.empty((config.max_blobs, blobs.COLUMNS)), 0, 0
     for view in views:
         last = first + len(view.patches)
-        where = _sampled(view.patches)
+        where = _sampled(view)
         for k, image in reversed(list(enumerate(view.levels))):  # if room runs out, it is fine texture that is left out
             level = view.base + k
             if level < view.first:
@@ -206,10 +222,11 @@ def candidates(views: list[Canvas], patches: Indices, config: DetectConfig) -> A
             places = where[0] >> level, where[1] >> level
             response = np.empty((*image.shape[:2], 4 if image.shape[2] == 3 else 1), np.float32)
             fine = _blur(image, _SCALES[0])
-            for a, b in pairwise(_SCALES.tolist()):
+            for scale, (a, b) in enumerate(pairwise(_SCALES.tolist())):
                 wide = _blur(fine, math.sqrt(b * b - a * a))
                 blobs.differences(fine, wide, response)
                 noise = _noise(response[places], _ROUNDING / a)
+                noise = scan.noise.setdefault((level, scale), noise).clip(max=noise)
                 least = config.min_snr * noise
                 count = blobs.maxima(
                     response,
@@ -221,7 +238,7 @@ def candidates(views: list[Canvas], patches: Indices, config: DetectConfig) -> A
                     scale=a,
                     patches=patches,
                     first=first,
-                    last=last,
+                    last=last - view.unsearched,
                     found=found,
                     count=count,
                 )
@@ -245,15 +262,19 @@ def _noise(sampled: Array, least: float) -> Array:
     return np.asarray(np.maximum(_SIGMA * away[:, away.shape[1] // 2], least), np.float64)
 
 
-def _sampled(patches: Indices) -> tuple[Indices, Indices]:
-    """Rows and columns of the canvas px, spread evenly over its patches."""
-    size = patches[:, 2:4] - patches[:, :2]
+def _sampled(view: Canvas) -> tuple[Indices, Indices]:
+    """Rows and columns of the canvas px where noise is measured, spread evenly over patches."""
+    measured = view.patches[-view.unsearched :] if view.unsearched else view.patches
+    low = measured[:, [blobs.CORE_LEFT, blobs.CORE_TOP]]
+    size = measured[:, [blobs.CORE_RIGHT, blobs.CORE_BOTTOM]] - low
+    if not view.unsearched:
+        low, size = measured[:, :2], measured[:, 2:4] - measured[:, :2]
     area = size.prod(axis=1)
     ends = np.cumsum(area)
     at = np.linspace(0, ends[-1] - 1, _SAMPLES).astype(np.int64)
     k = np.searchsorted(ends, at, side="right")
     inside = at - (ends[k] - area[k])
-    return patches[k, 1] + inside // size[k, 0], patches[k, 0] + inside % size[k, 0]
+    return low[k, 1] + inside // size[k, 0], low[k, 0] + inside % size[k, 0]
 
 
 def _edge(rows: Array, shape: tuple[int, ...]) -> Array:

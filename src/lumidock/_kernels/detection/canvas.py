@@ -28,13 +28,15 @@ class Canvas(NamedTuple):
 
     Blobs are searched from level `first` on; finer ones serve to measure them. `patches` (N, PATCH_COLUMNS), columns of
     `blobs`: left, top, right and bottom on the canvas, u and v of the frame at its left top pixel, the core of the
-    patch on the canvas, in which blobs count, and the part of it that is in the frame; all in pixels of level 0.
+    patch on the canvas, in which blobs count, and the part of it that is in the frame; all in pixels of level 0. The
+    last `unsearched` of the patches serve to measure the noise; where there are none, all patches do.
     """
 
     base: int
     first: int
     levels: list[Array]
     patches: Indices
+    unsearched: int = 0
 
 
 def halved(image: Array) -> Array:
@@ -43,10 +45,13 @@ def halved(image: Array) -> Array:
     return np.asarray(small.reshape(small.shape[0], small.shape[1], -1), np.float32)
 
 
-def canvas(image: Image, given: int, cores: Indices, margin: int, levels: tuple[int, int]) -> Canvas:
+def canvas(
+    image: Image, given: int, cores: Indices, margin: int, levels: tuple[int, int], unsearched: int = 0
+) -> Canvas:
     """Cut `cores` (N, 4: u0, v0, u1, v1) with `margin` px around them out of level `given` of a frame's pyramid.
 
-    `levels` are the first and the last that are made. Beyond the border the frame is mirrored.
+    `levels` are the first and the last that are made; the last `unsearched` of the cores serve to measure the noise.
+    Beyond the border the frame is mirrored.
     """
     base, top = levels
     pixel = 1 << top
@@ -65,7 +70,7 @@ def canvas(image: Image, given: int, cores: Indices, margin: int, levels: tuple[
     pyramid = [room]
     for _ in range(base, top):
         pyramid.append(halved(pyramid[-1]))
-    return Canvas(base, base, pyramid, patches)
+    return Canvas(base, base, pyramid, patches, unsearched)
 
 
 def _packed(outer: Indices, cores: Indices) -> tuple[Indices, int, int]:
