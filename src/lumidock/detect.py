@@ -104,7 +104,8 @@ def seen(frame: Frame, scan: Scan, predicted: Array | None = None) -> Seen | Non
     if frame.encoding.startswith("bayer"):
         _widen_sparse(found, scan.config.mosaic_px)
     best = one_per_light(found, image.shape, scan.config)
-    return _described(views, patches, best)
+    area = float(image.shape[0] * image.shape[1]) if predicted is None else _searched(views[0])
+    return _described(views, patches, best, area)
 
 
 def _none(frame: Frame) -> Detections:
@@ -390,7 +391,13 @@ def _fused(found: Blobs, best: Indices, partner: Indices, config: DetectConfig) 
     return uv, cov + config.floor_px**2 * np.eye(2)
 
 
-def _described(views: list[Canvas], patches: Indices, best: Blobs) -> Seen:
+def _searched(view: Canvas) -> float:
+    """Area of the cores of patches, px^2."""
+    low, high = [blobs.CORE_LEFT, blobs.CORE_TOP], [blobs.CORE_RIGHT, blobs.CORE_BOTTOM]
+    return float((view.patches[:, high] - view.patches[:, low]).prod(axis=1).sum())
+
+
+def _described(views: list[Canvas], patches: Indices, best: Blobs, area_px2: float) -> Seen:
     """The same with the rings around them."""
     planes = 4 if views[0].levels[0].shape[2] == 3 else 1
     rings = np.zeros((len(best.rows), 3, planes, profiles.RINGS))
@@ -400,7 +407,7 @@ def _described(views: list[Canvas], patches: Indices, best: Blobs) -> Seen:
         for k, image in enumerate(view.levels):
             profiles.rings(image, patches, view.base + k, part, xy[mine], its_rings)
         rings[mine] = its_rings
-    return Seen(best.rows, best.cov, best.measured, rings)
+    return Seen(best.rows, best.cov, best.measured, rings, np.full(len(rings), area_px2))
 
 
 def _detections(frame: Frame, found: Seen, scan: Scan) -> Detections:

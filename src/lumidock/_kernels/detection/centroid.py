@@ -16,7 +16,7 @@ _START = 0.7  # sizes from the border, at least, where the search for a maximum 
 _REACH = 3.0  # standard deviations of the wider Gaussian that are summed: 1.1 % of its mass lies beyond
 _MOST = 35  # samples of a row at most: 2 * 3 * 2 * 1.27 * 2 + 1 at the widest filter, rounded up
 _STEPS = 6
-_GRADIENT_VAR = 13.0 / 12.0  # s^2 times the variance of the response's gradient over that of the response, white noise
+GRADIENT_VAR = 13.0 / 12.0  # s^2 times the variance of the response's gradient over that of the response, white noise
 M_X, M_Y, M_HEIGHT, M_XX, M_XY, M_YY, M_SHIFT_X, M_SHIFT_Y, M_SHIFTS, M_OK, M_RATIO = range(11)
 MEASURES = 11
 
@@ -55,7 +55,7 @@ def centroids(image: Array, patches: Indices, level: int, blobs: Array, out: Arr
 @part
 def _covariance_of_noise(value: Array, s: float, row: Array) -> None:
     """Write H^-1 G H^-1, where G is the covariance that the gradient has for response noise of 1."""
-    g = _GRADIENT_VAR / (s * s)
+    g = GRADIENT_VAR / (s * s)
     h_xx, h_xy, h_yy = value[3], value[4], value[5]
     det = h_xx * h_yy - h_xy * h_xy
     if det <= 0.0 or h_xx >= 0.0:
