@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lumidock import lamp
+from lumidock import exposure, lamp
 from lumidock._kernels.detection import blobs, centroid, groups, live, profiles
 from lumidock._kernels.detection.canvas import Canvas, canvas
 from lumidock.config import DetectConfig
@@ -62,6 +62,7 @@ class Scan:
     def forget(self) -> None:
         """Drop what the frames before say."""
         self.saturated = SATURATED
+        self.glare = 0.0  # share of the picture that is saturated
         self.size_px = 0.0
         self.noise: dict[tuple[int, int], Array] = {}  # (P,) of the responses of a level and a scale
 
@@ -82,9 +83,9 @@ def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None, predict
     """
     scan = scan if scan is not None and scan.fits(frame) else Scan(frame, config)
     if min(frame.image.shape[:2]) < _LEAST_SIDE:
-        return _none(frame)
+        return _none(frame, scan)
     found = seen(frame, scan, predicted)
-    return _none(frame) if found is None else _detections(frame, found, scan)
+    return _none(frame, scan) if found is None else _detections(frame, found, scan)
 
 
 def seen(frame: Frame, scan: Scan, predicted: Array | None = None) -> Seen | None:
@@ -99,6 +100,8 @@ def seen(frame: Frame, scan: Scan, predicted: Array | None = None) -> Seen | Non
     patches = np.concatenate([view.patches for view in views])
     if predicted is None:
         scan.noise = {}
+    else:
+        scan.glare = 0.0
     maxima = one_per_plane(candidates(views, patches, scan), image.shape, scan.config)
     found = measured(views, patches, maxima, image.shape, scan.config)
     if frame.encoding.startswith("bayer"):
@@ -108,7 +111,7 @@ def seen(frame: Frame, scan: Scan, predicted: Array | None = None) -> Seen | Non
     return _described(views, patches, best, area)
 
 
-def _none(frame: Frame) -> Detections:
+def _none(frame: Frame, scan: Scan) -> Detections:
     nothing = np.empty(0)
     uv, cov = np.empty((0, 2)), np.empty((0, 2, 2))
     return Detections(
@@ -121,6 +124,7 @@ def _none(frame: Frame) -> Detections:
         p_rear=nothing,
         cov_px2=cov,
         attitude=frame.attitude,
+        exposure_factor=exposure.factor(nothing, scan.glare, linear=True),
     )
 
 
@@ -142,6 +146,7 @@ def everywhere(image: Image, scan: Scan) -> list[Canvas]:
         return [canvas(image, 0, whole, margin, (0, _COARSE))]
     pyramid = live.halvings(image, _COARSE)
     scan.saturated = _saturation(pyramid[1])
+    scan.glare = float((pyramid[_COARSE] >= scan.saturated * _full_scale(image) / 255.0).mean())
     if height * width <= config.full_area_px:
         cores = whole
     else:
@@ -166,6 +171,10 @@ def _squares(height: int, width: int) -> Indices:
     v, u = np.meshgrid(np.arange(rows) + 0.5, np.arange(columns) + 0.5, indexing="ij")
     low = np.column_stack([u.ravel() * width / columns, v.ravel() * height / rows]).astype(np.int64) - _SQUARE_PX // 2
     return np.concatenate([low, low + _SQUARE_PX], axis=1)
+
+
+def _full_scale(image: Image) -> float:
+    return float(np.iinfo(image.dtype).max)
 
 
 def _base(area: float, most: float) -> int:
@@ -413,6 +422,7 @@ def _described(views: list[Canvas], patches: Indices, best: Blobs, area_px2: flo
 def _detections(frame: Frame, found: Seen, scan: Scan) -> Detections:
     """What is said of them, in pixels of the frame as it came."""
     p_light, radius_px, flux = lamp.likelihood(found), *lamp.radius_and_flux(found)
+    asked = _exposure_factor(frame, found, p_light, scan)
     shown = p_light >= scan.config.min_p_light
     p_light, radius_px, flux = p_light[shown], radius_px[shown], flux[shown]
     found = Seen(*(part[shown] for part in found))
@@ -435,4 +445,13 @@ def _detections(frame: Frame, found: Seen, scan: Scan) -> Detections:
         p_rear=unknown,
         cov_px2=cov,
         attitude=frame.attitude,
+        exposure_factor=asked,
     )
+
+
+def _exposure_factor(frame: Frame, found: Seen, p_light: Array, scan: Scan) -> float:
+    """What the cores of the lamps, each in its own plane, say of the exposure."""
+    lamps = np.flatnonzero(p_light > 0.5)
+    cores = found.rings[lamps, profiles.MEAN, found.rows[lamps, blobs.PLANE].astype(np.int64), 0]
+    linear = frame.encoding.startswith("bayer") or frame.image.dtype == np.uint16
+    return exposure.factor(cores / scan.saturated, scan.glare, linear=linear)

@@ -34,6 +34,7 @@ class Summary:
     stage: Counter[str] = field(default_factory=Counter)
     reason: Counter[str] = field(default_factory=Counter)
     nis: list[float] = field(default_factory=list)
+    exposure_factor: list[float] = field(default_factory=list)
     latency_us: list[int] = field(default_factory=list)
     first_error: str = ""
     finished: bool = False
@@ -51,6 +52,8 @@ class Summary:
         self.first_error = self.first_error or error
         if math.isfinite(fix.nis):
             self.nis.append(fix.nis)
+        if math.isfinite(fix.exposure_factor):
+            self.exposure_factor.append(fix.exposure_factor)
         if latency_us is not None:
             self.latency_us.append(latency_us)
 
@@ -68,9 +71,19 @@ class Summary:
             "valid_by_stage": {name: count for name, count in self.stage.items() if count},
             "reason": {name: count for name, count in self.reason.items() if count},
             "nis": {"frames": len(self.nis), "mean": sum(self.nis) / len(self.nis)} if self.nis else None,
+            "exposure": self._exposure(),
             "latency_us": latency,
             "finished": self.finished,
         }
+
+    def _exposure(self) -> dict[str, Any] | None:
+        """In how many frames the exposure was judged, too bright and too dark, and the mean of the factor it needs."""
+        asked = np.array(self.exposure_factor)
+        if not len(asked):
+            return None
+        too_bright, too_dark = int((asked < 1.0).sum()), int((asked > 1.0).sum())
+        factor = float(np.exp(np.log(asked).mean()))
+        return {"frames": len(asked), "too_bright": too_bright, "too_dark": too_dark, "factor": round(factor, 3)}
 
 
 @dataclass(frozen=True, slots=True)

@@ -242,6 +242,12 @@ def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:
     )
     if counts["reason"]:
         print("not valid: " + ", ".join(f"{word} {count}" for word, count in sorted(counts["reason"].items())))
+    asked = counts["exposure"]
+    if asked and asked["too_bright"]:
+        print(
+            f"lights overexposed in {asked['too_bright']} of {asked['frames']} frames: "
+            f"shorten the exposure to about x{asked['factor']:.2g}"
+        )
 
 
 @app.command(
