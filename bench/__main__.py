@@ -13,6 +13,7 @@ from pathlib import Path
 
 from bench import (
     acquisition,
+    aiding,
     association,
     configuration,
     contact_sheet,
@@ -23,7 +24,9 @@ from bench import (
     docks,
     images,
     lamp_weights,
+    learned_matcher,
     nominal,
+    ports,
     rendering,
     reproduced,
     speed,
@@ -34,6 +37,7 @@ from bench import (
 BENCHES = {
     "acquisition": acquisition,
     "nominal": nominal,
+    "ports": ports,
     "association": association,
     "table1": table1,
     "images": images,
@@ -42,6 +46,8 @@ BENCHES = {
     "detector-errors": detector_errors,
     "detector-constants": detector_constants,
     "lamp-weights": lamp_weights,
+    "learned-matcher": learned_matcher,
+    "aiding": aiding,
     "dockings": dockings,
     "docks": docks,
     "visibility": visibility,
