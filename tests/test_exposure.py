@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from bench.lamp_scenes import small_camera
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.lamp_scenes import small_camera
 from lumidock import exposure
 from lumidock.camera import load_camera
 from lumidock.datatypes import Frame

@@ -293,9 +293,7 @@ def _edge(rows: Array, shape: tuple[int, ...]) -> Array:
     return np.asarray(np.minimum(at, (shape[1], shape[0]) - at))
 
 
-def measured(
-    views: list[Canvas], patches: Indices, rows: Array, shape: tuple[int, ...], config: DetectConfig
-) -> Blobs:
+def measured(views: list[Canvas], patches: Indices, rows: Array, shape: tuple[int, ...], config: DetectConfig) -> Blobs:
     """Their centroids and covariances; without those that are no maxima of the continuous filter."""
     rows = _finer(views, rows)
     out = np.zeros((len(rows), centroid.MEASURES))
