@@ -55,8 +55,8 @@ def maxima(
     """Append the 3 x 3 maxima of `response` (H, W, P) to `found`; returns the new count.
 
     A maximum must exceed `least` (P,) and `clear` times the texture around it, and have a ratio of its curvatures over
-    `roundness`. `patches` (N, PATCH_COLUMNS), rectangles of the canvas in pixels of the frame, are searched from `first` to
-    `last`; a maximum counts where it lies in the core of one.
+    `roundness`. `patches` (N, PATCH_COLUMNS), rectangles of the canvas in pixels of the frame, are searched from
+    `first` to `last`; a maximum counts where it lies in the core of one.
     """
     height, width, planes = response.shape
     away = np.empty(2 * _SPOKES)

@@ -97,7 +97,7 @@ def _mark_seen(patches: Indices, width: int, height: int) -> None:
     shift = patches[:, :2] - patches[:, 4:6]
     low, high = patches[:, :2], patches[:, 2:4]
     patches[:, [SEEN_LEFT, SEEN_TOP]] = np.maximum(low, shift)
-    patches[:, [SEEN_RIGHT, SEEN_BOTTOM]] = np.minimum(high, shift + (width, height))
+    patches[:, [SEEN_RIGHT, SEEN_BOTTOM]] = np.minimum(high, shift + np.array([width, height]))
 
 
 def _cut(image: Image, box: Indices, small: int) -> Image:
