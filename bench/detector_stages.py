@@ -54,7 +54,7 @@ def stages(frame: Frame, uv: Array, config: DetectConfig) -> Lost:
 def near(rows: Array, uv: Array) -> np.ndarray:
     """Whether a blob lies near each place (M, 2)."""
     away = np.linalg.norm(uv[:, None] - rows[None][:, :, [blobs.U, blobs.V]], axis=2)
-    return np.asarray((away < np.maximum(_NEAR_PX, _NEAR_SHARE * rows[:, blobs.SIZE])).any(axis=1))
+    return np.asarray(np.any(away < np.maximum(_NEAR_PX, _NEAR_SHARE * rows[:, blobs.SIZE]), axis=1))
 
 
 def _in_cores(fine: Indices, uv: Array) -> np.ndarray:
