@@ -170,7 +170,7 @@ class PaperConfig(SettingsGroup):
 class DetectConfig(SettingsGroup):
     """Light detection of the default method: docs/detector.md derives each number or shows what it changes."""
 
-    min_snr: PositiveFloat = 5.0  # of a blob's response, sigmas of its noise
+    min_snr: PositiveFloat = 4.0  # of a blob's response, sigmas of its noise
     clear: PositiveFloat = 2.0  # of a blob's response, sigmas of the texture around it
     roundness: Fraction = 0.12  # smaller over larger curvature of a response; an edge or a rope has none
     share: Fraction = 0.35  # of the strongest blob's height, that a more precise one of the same light must have

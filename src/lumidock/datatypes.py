@@ -138,6 +138,8 @@ class Detections:
     `uv` (N, 2) centroids px; `radius_px` (N,) equal-area radius at half peak; `flux` (N,) grey levels summed over the
     blob; `p_light` (N,) probability of being a lamp; `p_rear` (N,) probability of belonging to the rear layer, NaN
     where nothing is known; `cov_px2` (N, 2, 2) covariance of the centroids, None where the detector gives none.
+    `exposure_factor`: by what the exposure should be multiplied (`lumidock.exposure`), NaN where the detector does not
+    know.
     """
 
     frame: str
@@ -149,6 +151,7 @@ class Detections:
     p_rear: Array
     cov_px2: Array | None = None
     attitude: Attitude | None = None
+    exposure_factor: float = math.nan
 
     def __post_init__(self) -> None:
         require_stamp(self.t_ns)
@@ -353,3 +356,8 @@ class Fix:
     def valid(self) -> bool:
         """Whether the full pose may be used."""
         return self.T_dock_cam is not None
+
+    @property
+    def exposure_factor(self) -> float:
+        """By what exposure times gain should be multiplied: 1 right, below 1 too bright; NaN where it is not known."""
+        return math.nan if self.match is None else self.match.detections.exposure_factor

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lumidock import lamp
+from lumidock import exposure, lamp
 from lumidock._kernels.detection import blobs, centroid, groups, live, profiles
 from lumidock._kernels.detection.canvas import Canvas, canvas
 from lumidock.config import DetectConfig
@@ -27,6 +27,7 @@ from lumidock.picture import in_color
 _SCALES = 0.9 * np.sqrt(2.0) ** np.arange(3)  # standard deviations of the Gaussians, pixels of their level
 _TAPS = 3.0  # standard deviations on each side that a filter sums: 0.3 % of a Gaussian is beyond
 _SAMPLES = 1024  # responses whose median absolute value is the noise: known to 4 %
+_SQUARES, _SQUARE_PX = (4, 3), 24  # columns and rows of squares of the frame where noise is measured, and their side
 _SIGMA = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 _ROUNDING = 0.29 * 0.115  # response noise of rounding at scale 1: 1/sqrt(12) grey levels times the filter's gain
 _BORDER = 2.5  # distance from the border, in blob sizes, within which mirrored samples bias the centroid toward it
@@ -61,10 +62,12 @@ class Scan:
     def forget(self) -> None:
         """Drop what the frames before say."""
         self.saturated = SATURATED
+        self.glare = 0.0  # share of the picture that is saturated
         self.size_px = 0.0
+        self.noise: dict[tuple[int, int], Array] = {}  # (P,) of the responses of a level and a scale
 
 
-class _Blobs(NamedTuple):
+class Blobs(NamedTuple):
     """Blobs: `rows` (N, columns of `blobs`), U and V px among them, `cov` (N, 2, 2) px^2, `measured` (N, MEASURES)."""
 
     rows: Array
@@ -80,29 +83,35 @@ def lights(frame: Frame, config: DetectConfig, scan: Scan | None = None, predict
     """
     scan = scan if scan is not None and scan.fits(frame) else Scan(frame, config)
     if min(frame.image.shape[:2]) < _LEAST_SIDE:
-        return _none(frame)
+        return _none(frame, scan)
     found = seen(frame, scan, predicted)
-    return _none(frame) if found is None else _detections(frame, found, scan)
+    return _none(frame, scan) if found is None else _detections(frame, found, scan)
 
 
 def seen(frame: Frame, scan: Scan, predicted: Array | None = None) -> Seen | None:
     """The blobs of `lights`, with what is known of each; in px of the frame as `scan` stretches it."""
     image = _squared(in_color(frame), scan.stretch)
     if predicted is None:
-        views = _everywhere(image, scan)
+        views = everywhere(image, scan)
     else:
         views = _windows(image, predicted * [*scan.stretch, scan.stretch.max()], scan)
     if not views:
         return None
     patches = np.concatenate([view.patches for view in views])
-    found = _blobs(views, patches, image.shape, scan.config)
+    if predicted is None:
+        scan.noise = {}
+    else:
+        scan.glare = 0.0
+    maxima = one_per_plane(candidates(views, patches, scan), image.shape, scan.config)
+    found = measured(views, patches, maxima, image.shape, scan.config)
     if frame.encoding.startswith("bayer"):
         _widen_sparse(found, scan.config.mosaic_px)
-    best = _one_per_light(found, image.shape, scan.config)
-    return _described(views, patches, best)
+    best = one_per_light(found, image.shape, scan.config)
+    area = float(image.shape[0] * image.shape[1]) if predicted is None else _searched(views[0])
+    return _described(views, patches, best, area)
 
 
-def _none(frame: Frame) -> Detections:
+def _none(frame: Frame, scan: Scan) -> Detections:
     nothing = np.empty(0)
     uv, cov = np.empty((0, 2)), np.empty((0, 2, 2))
     return Detections(
@@ -115,6 +124,7 @@ def _none(frame: Frame) -> Detections:
         p_rear=nothing,
         cov_px2=cov,
         attitude=frame.attitude,
+        exposure_factor=exposure.factor(nothing, scan.glare, linear=True),
     )
 
 
@@ -127,7 +137,7 @@ def _squared(image: Image, stretch: Array) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR))
 
 
-def _everywhere(image: Image, scan: Scan) -> list[Canvas]:
+def everywhere(image: Image, scan: Scan) -> list[Canvas]:
     """The live tiles at fine levels, and all of the frame at coarse ones."""
     config, (height, width) = scan.config, image.shape[:2]
     whole = np.array([[0, 0, width, height]], np.int64)
@@ -136,6 +146,7 @@ def _everywhere(image: Image, scan: Scan) -> list[Canvas]:
         return [canvas(image, 0, whole, margin, (0, _COARSE))]
     pyramid = live.halvings(image, _COARSE)
     scan.saturated = _saturation(pyramid[1])
+    scan.glare = float((pyramid[_COARSE] >= scan.saturated * _full_scale(image) / 255.0).mean())
     if height * width <= config.full_area_px:
         cores = whole
     else:
@@ -148,7 +159,22 @@ def _everywhere(image: Image, scan: Scan) -> list[Canvas]:
     if area > height * width:
         cores, area = whole, float(height * width)
     base = _base(area, config.full_area_px)
-    return [coarse, canvas(image, 0, cores, margin, (base, _COARSE - 1))]
+    if cores is whole:
+        return [coarse, canvas(image, 0, cores, margin, (base, _COARSE - 1))]
+    squares = _squares(height, width)
+    return [coarse, canvas(image, 0, np.concatenate([cores, squares]), margin, (base, _COARSE - 1), len(squares))]
+
+
+def _squares(height: int, width: int) -> Indices:
+    """Boxes (N, 4) u0, v0, u1, v1 px, spread evenly over a frame: live tiles are full of lamps and tell no noise."""
+    columns, rows = _SQUARES
+    v, u = np.meshgrid(np.arange(rows) + 0.5, np.arange(columns) + 0.5, indexing="ij")
+    low = np.column_stack([u.ravel() * width / columns, v.ravel() * height / rows]).astype(np.int64) - _SQUARE_PX // 2
+    return np.concatenate([low, low + _SQUARE_PX], axis=1)
+
+
+def _full_scale(image: Image) -> float:
+    return float(np.iinfo(image.dtype).max)
 
 
 def _base(area: float, most: float) -> int:
@@ -192,12 +218,13 @@ def _blur(image: Array, sigma: float) -> Array:
     return np.asarray(out.reshape(image.shape))
 
 
-def _blobs(views: list[Canvas], patches: Indices, shape: tuple[int, ...], config: DetectConfig) -> _Blobs:
-    """Maxima over all planes, scales and levels, with their centroids."""
+def candidates(views: list[Canvas], patches: Indices, scan: Scan) -> Array:
+    """Maxima (N, columns of `blobs`) over all planes, scales and levels."""
+    config = scan.config
     found, count, first = np.empty((config.max_blobs, blobs.COLUMNS)), 0, 0
     for view in views:
         last = first + len(view.patches)
-        where = _sampled(view.patches)
+        where = _sampled(view)
         for k, image in reversed(list(enumerate(view.levels))):  # if room runs out, it is fine texture that is left out
             level = view.base + k
             if level < view.first:
@@ -205,10 +232,11 @@ def _blobs(views: list[Canvas], patches: Indices, shape: tuple[int, ...], config
             places = where[0] >> level, where[1] >> level
             response = np.empty((*image.shape[:2], 4 if image.shape[2] == 3 else 1), np.float32)
             fine = _blur(image, _SCALES[0])
-            for a, b in pairwise(_SCALES.tolist()):
+            for scale, (a, b) in enumerate(pairwise(_SCALES.tolist())):
                 wide = _blur(fine, math.sqrt(b * b - a * a))
                 blobs.differences(fine, wide, response)
                 noise = _noise(response[places], _ROUNDING / a)
+                noise = scan.noise.setdefault((level, scale), noise).clip(max=noise)
                 least = config.min_snr * noise
                 count = blobs.maxima(
                     response,
@@ -220,18 +248,22 @@ def _blobs(views: list[Canvas], patches: Indices, shape: tuple[int, ...], config
                     scale=a,
                     patches=patches,
                     first=first,
-                    last=last,
+                    last=last - view.unsearched,
                     found=found,
                     count=count,
                 )
                 fine = wide
         first = last
-    rows = found[:count]
+    return found[:count]
+
+
+def one_per_plane(rows: Array, shape: tuple[int, ...], config: DetectConfig) -> Array:
+    """Those of the maxima that stand for themselves in their own plane, the strongest first."""
     order = np.argsort(-rows[:, blobs.HEIGHT], kind="stable")
-    kept = np.ones(count)
+    kept = np.ones(len(rows))
     edge, limits = _edge(rows, shape).min(axis=1), (config.reach, config.wide, config.texture)
     groups.strongest(rows, edge, order, *limits, kept)
-    return _measured(views, patches, rows[order[kept[order] > 0.0]], shape, config)
+    return np.asarray(rows[order[kept[order] > 0.0]])
 
 
 def _noise(sampled: Array, least: float) -> Array:
@@ -240,15 +272,19 @@ def _noise(sampled: Array, least: float) -> Array:
     return np.asarray(np.maximum(_SIGMA * away[:, away.shape[1] // 2], least), np.float64)
 
 
-def _sampled(patches: Indices) -> tuple[Indices, Indices]:
-    """Rows and columns of the canvas px, spread evenly over its patches."""
-    size = patches[:, 2:4] - patches[:, :2]
+def _sampled(view: Canvas) -> tuple[Indices, Indices]:
+    """Rows and columns of the canvas px where noise is measured, spread evenly over patches."""
+    measured = view.patches[-view.unsearched :] if view.unsearched else view.patches
+    low = measured[:, [blobs.CORE_LEFT, blobs.CORE_TOP]]
+    size = measured[:, [blobs.CORE_RIGHT, blobs.CORE_BOTTOM]] - low
+    if not view.unsearched:
+        low, size = measured[:, :2], measured[:, 2:4] - measured[:, :2]
     area = size.prod(axis=1)
     ends = np.cumsum(area)
     at = np.linspace(0, ends[-1] - 1, _SAMPLES).astype(np.int64)
     k = np.searchsorted(ends, at, side="right")
     inside = at - (ends[k] - area[k])
-    return patches[k, 1] + inside // size[k, 0], patches[k, 0] + inside % size[k, 0]
+    return low[k, 1] + inside // size[k, 0], low[k, 0] + inside % size[k, 0]
 
 
 def _edge(rows: Array, shape: tuple[int, ...]) -> Array:
@@ -257,17 +293,15 @@ def _edge(rows: Array, shape: tuple[int, ...]) -> Array:
     return np.asarray(np.minimum(at, (shape[1], shape[0]) - at))
 
 
-def _measured(
-    views: list[Canvas], patches: Indices, rows: Array, shape: tuple[int, ...], config: DetectConfig
-) -> _Blobs:
+def measured(views: list[Canvas], patches: Indices, rows: Array, shape: tuple[int, ...], config: DetectConfig) -> Blobs:
     """Their centroids and covariances; without those that are no maxima of the continuous filter."""
     rows = _finer(views, rows)
     out = np.zeros((len(rows), centroid.MEASURES))
     for view, mine in _by_view(views, rows):
-        part, measured = rows[mine], out[mine]
+        part, its = rows[mine], out[mine]
         for k, image in enumerate(view.levels):
-            centroid.centroids(image, patches, view.base + k, part, measured)
-        out[mine] = measured
+            centroid.centroids(image, patches, view.base + k, part, its)
+        out[mine] = its
     holds = (out[:, centroid.M_OK] == 1.0) & (out[:, centroid.M_HEIGHT] > config.clear * rows[:, blobs.NOISE])
     rows, out = rows[holds], out[holds]
     pixel = 2.0 ** rows[:, blobs.LEVEL]
@@ -279,7 +313,7 @@ def _measured(
     near = np.maximum(_BORDER * rows[:, [blobs.SIZE]] - _edge(rows, shape), 0.0)  # mirrored samples draw it there
     for axis in range(2):
         cov[:, axis, axis] += (config.border_share * near[:, axis]) ** 2
-    return _Blobs(rows, cov, out)
+    return Blobs(rows, cov, out)
 
 
 def _by_view(views: list[Canvas], rows: Array) -> Iterator[tuple[Canvas, NDArray[np.bool_]]]:
@@ -291,7 +325,7 @@ def _by_view(views: list[Canvas], rows: Array) -> Iterator[tuple[Canvas, NDArray
         first = last
 
 
-def _widen_sparse(found: _Blobs, mosaic_px: float) -> None:
+def _widen_sparse(found: Blobs, mosaic_px: float) -> None:
     """Add to the covariance of small blobs in blue and red of a mosaic, of which every fourth pixel is a sample."""
     size, plane = found.rows[:, blobs.SIZE], found.rows[:, blobs.PLANE]
     sparse = np.where((plane == 0.0) | (plane == 2.0), mosaic_px**2 * np.exp(-0.5 * size**2), 0.0)
@@ -325,7 +359,7 @@ def _covariance(rows: Array, out: Array, pixel: Array, config: DetectConfig) -> 
     return np.asarray(cov + rest[:, None, None] * np.eye(2))
 
 
-def _one_per_light(found: _Blobs, shape: tuple[int, ...], config: DetectConfig) -> _Blobs:
+def one_per_light(found: Blobs, shape: tuple[int, ...], config: DetectConfig) -> Blobs:
     """The blob that stands for each light, the strongest first."""
     rows = found.rows
     order = np.argsort(-rows[:, blobs.HEIGHT], kind="stable")
@@ -337,10 +371,10 @@ def _one_per_light(found: _Blobs, shape: tuple[int, ...], config: DetectConfig) 
     uv, cov = _fused(found, best, partner, config)
     rows = rows[best]
     rows[:, [blobs.U, blobs.V]] = uv
-    return _Blobs(rows, cov, found.measured[best])
+    return Blobs(rows, cov, found.measured[best])
 
 
-def _fused(found: _Blobs, best: Indices, partner: Indices, config: DetectConfig) -> tuple[Array, Array]:
+def _fused(found: Blobs, best: Indices, partner: Indices, config: DetectConfig) -> tuple[Array, Array]:
     """Centroids (n, 2) and covariances of lights: of the best blob, or of all planes that show the same core.
 
     The estimates of blue, green and red are weighted by their inverse covariances where they agree with the best one.
@@ -364,7 +398,13 @@ def _fused(found: _Blobs, best: Indices, partner: Indices, config: DetectConfig)
     return uv, cov + config.floor_px**2 * np.eye(2)
 
 
-def _described(views: list[Canvas], patches: Indices, best: _Blobs) -> Seen:
+def _searched(view: Canvas) -> float:
+    """Area of the cores of patches, px^2."""
+    low, high = [blobs.CORE_LEFT, blobs.CORE_TOP], [blobs.CORE_RIGHT, blobs.CORE_BOTTOM]
+    return float((view.patches[:, high] - view.patches[:, low]).prod(axis=1).sum())
+
+
+def _described(views: list[Canvas], patches: Indices, best: Blobs, area_px2: float) -> Seen:
     """The same with the rings around them."""
     planes = 4 if views[0].levels[0].shape[2] == 3 else 1
     rings = np.zeros((len(best.rows), 3, planes, profiles.RINGS))
@@ -374,12 +414,13 @@ def _described(views: list[Canvas], patches: Indices, best: _Blobs) -> Seen:
         for k, image in enumerate(view.levels):
             profiles.rings(image, patches, view.base + k, part, xy[mine], its_rings)
         rings[mine] = its_rings
-    return Seen(best.rows, best.cov, best.measured, rings)
+    return Seen(best.rows, best.cov, best.measured, rings, np.full(len(rings), area_px2))
 
 
 def _detections(frame: Frame, found: Seen, scan: Scan) -> Detections:
     """What is said of them, in pixels of the frame as it came."""
     p_light, radius_px, flux = lamp.likelihood(found), *lamp.radius_and_flux(found)
+    asked = _exposure_factor(frame, found, p_light, scan)
     shown = p_light >= scan.config.min_p_light
     p_light, radius_px, flux = p_light[shown], radius_px[shown], flux[shown]
     found = Seen(*(part[shown] for part in found))
@@ -402,4 +443,13 @@ def _detections(frame: Frame, found: Seen, scan: Scan) -> Detections:
         p_rear=unknown,
         cov_px2=cov,
         attitude=frame.attitude,
+        exposure_factor=asked,
     )
+
+
+def _exposure_factor(frame: Frame, found: Seen, p_light: Array, scan: Scan) -> float:
+    """What the cores of the lamps, each in its own plane, say of the exposure."""
+    lamps = np.flatnonzero(p_light > 0.5)
+    cores = found.rings[lamps, profiles.MEAN, found.rows[lamps, blobs.PLANE].astype(np.int64), 0]
+    linear = frame.encoding.startswith("bayer") or frame.image.dtype == np.uint16
+    return exposure.factor(cores / scan.saturated, scan.glare, linear=linear)

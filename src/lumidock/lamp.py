@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lumidock._kernels.detection import blobs, centroid
+from lumidock._kernels.detection.centroid import GRADIENT_VAR
 from lumidock._kernels.detection.profiles import MEAN, MOST, SPREAD, STEP
 from lumidock.datatypes import Array
 
@@ -39,12 +40,16 @@ _STRONGEST = 4  # of a frame, whose mean height is what others are compared to: 
 
 
 class Seen(NamedTuple):
-    """N blobs, one of each light: `rows`, `cov` (N, 2, 2) px^2, `measured` and `rings` (N, 3, P, RINGS)."""
+    """N blobs, one of each light: `rows`, `cov` (N, 2, 2) px^2, `measured`, `rings` (N, 3, P, RINGS).
+
+    `area_px2` (N,): of what was searched for them.
+    """
 
     rows: Array
     cov: Array
     measured: Array
     rings: Array
+    area_px2: Array
 
 
 class _Profile(NamedTuple):
@@ -112,10 +117,23 @@ def _model() -> tuple[tuple[str, ...], Array, float]:
 
 
 def likelihood(seen: Seen) -> Array:
-    """Probability (N,) that each blob is a lamp."""
+    """Probability (N,) that each blob is a lamp: that it looks like one, and that noise has not made it."""
     names, weights, constant = _model()
     found = features(seen)
-    return np.asarray(1.0 / (1.0 + np.exp(-(np.column_stack([found[name] for name in names]) @ weights + constant))))
+    log_odds = np.column_stack([found[name] for name in names]) @ weights + constant
+    return np.asarray(1.0 / ((1.0 + np.exp(-log_odds)) * (1.0 + noise_maxima(seen))))
+
+
+def noise_maxima(seen: Seen) -> Array:
+    """How many maxima (N,) as high and at least as large as each blob noise alone is expected to make in all planes.
+
+    Of a Gaussian field f with var f' = l var f there are l k exp(-k^2 / 2) / (2 pi)^1.5 maxima over k sigma in a unit
+    of area (R. Adler, "The Geometry of Random Fields", 1981). For white noise l = 13 / (12 s^2), and all scales from
+    s on in steps of sqrt(2) have twice as many as s alone.
+    """
+    k = seen.rows[:, blobs.HEIGHT] / seen.rows[:, blobs.NOISE]
+    density = GRADIENT_VAR / seen.rows[:, blobs.SIZE] ** 2 * k * np.exp(-0.5 * k * k) / (2.0 * np.pi) ** 1.5
+    return np.asarray(2.0 * seen.rings.shape[2] * seen.area_px2 * density)
 
 
 def radius_and_flux(seen: Seen) -> tuple[Array, Array]:

@@ -25,6 +25,8 @@ from lumidock.station import Station
 from lumidock.track import Track, learned_calibration, sees_two_layers, track_bytes
 from lumidock.tracking import Prediction
 
+_SHOWS_TOO_LITTLE = ("no_lights", "too_few", "inconsistent", "residual", "protection")
+
 
 class Localizer:
     """Frames or detections in, one fix each out; remembers the frames before, in `state`, unless `cold`."""
@@ -70,7 +72,7 @@ class Localizer:
             self.scan = detect.Scan(frame, self.config.detect, self.camera.focal_px[0] / self.camera.focal_px[1])
         predicted = tracking.predict(self.state, frame.t_ns, self.context)
         found = detect.lights(frame, self.config.detect, self.scan, predicted.windows())
-        return self._step(layers.label(frame, found, self.config.label, self.scan.saturated), predicted)
+        return _overexposed(self._step(layers.label(frame, found, self.config.label, self.scan.saturated), predicted))
 
     def process_detections(self, detections: Detections) -> Fix:
         """The fix of one frame's detections, by a detector of one's own."""
@@ -86,6 +88,12 @@ class Localizer:
     def _step(self, detections: Detections, predicted: Prediction) -> Fix:
         fix, self.state = step(self.state, detections, predicted, self.context)
         return fix
+
+
+def _overexposed(fix: Fix) -> Fix:
+    """The same fix; where it lacks what the picture should show and that is too bright, `saturated` is the reason."""
+    bright = fix.exposure_factor < 1.0 and fix.reason in _SHOWS_TOO_LITTLE
+    return replace(fix, reason="saturated") if bright else fix
 
 
 def step(

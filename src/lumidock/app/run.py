@@ -43,6 +43,7 @@ class Summary:
     stage: Counter[str] = field(default_factory=Counter)
     reason: Counter[str] = field(default_factory=Counter)
     nis: list[float] = field(default_factory=list)
+    exposure_factor: list[float] = field(default_factory=list)
     latency_us: list[int] = field(default_factory=list)
     contradictions: dict[tuple[str, str], Contradicted] = field(default_factory=dict)
     first_error: str = ""
@@ -65,6 +66,8 @@ class Summary:
             self.contradictions[key] = Contradicted(before.frames + 1 if before else 1, against.text)
         if math.isfinite(fix.nis):
             self.nis.append(fix.nis)
+        if math.isfinite(fix.exposure_factor):
+            self.exposure_factor.append(fix.exposure_factor)
         if latency_us is not None:
             self.latency_us.append(latency_us)
 
@@ -86,9 +89,19 @@ class Summary:
                 for (file, subject), one in sorted(self.contradictions.items(), key=lambda item: -item[1].frames)
             ],
             "nis": {"frames": len(self.nis), "mean": sum(self.nis) / len(self.nis)} if self.nis else None,
+            "exposure": self._exposure(),
             "latency_us": latency,
             "finished": self.finished,
         }
+
+    def _exposure(self) -> dict[str, Any] | None:
+        """In how many frames the exposure was judged, too bright and too dark, and the mean of the factor it needs."""
+        asked = np.array(self.exposure_factor)
+        if not len(asked):
+            return None
+        too_bright, too_dark = int((asked < 1.0).sum()), int((asked > 1.0).sum())
+        factor = float(np.exp(np.log(asked).mean()))
+        return {"frames": len(asked), "too_bright": too_bright, "too_dark": too_dark, "factor": round(factor, 3)}
 
 
 def contradictions_in_words(counts: dict[str, Any], most: int = 3) -> list[str]:

@@ -7,6 +7,7 @@ fix to the sinks, each of which has a thread and a short queue of its own, so th
 from __future__ import annotations
 
 import gc
+import math
 import threading
 import time
 from collections import Counter, deque
@@ -326,6 +327,7 @@ class Server:
                 "reasons": dict(self.reasons),
                 "last": None if last is None else {"status": last.status, "stage": last.stage, "reason": last.reason},
                 "contradiction": self.contradiction,
+                "exposure_factor": None if last is None or math.isnan(last.exposure_factor) else last.exposure_factor,
                 "latency_ms": percentiles([us / 1000.0 for us in list(self.latency_us)]),
             },
             "sinks": {

@@ -230,6 +230,9 @@ def _require_another_folder(out: Path, source: Path) -> None:
         raise InputError(f"{out}: is the source; write the run elsewhere")
 
 
+_WORTH_SAYING = 0.95  # factor on the exposure, above which a shorter one changes little
+
+
 def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:
     """The counts of a run, for people or as JSON; what contradicts the files in words, beside them."""
     from lumidock.app.run import contradictions_in_words
@@ -245,6 +248,12 @@ def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:
     )
     if counts["reason"]:
         print("not valid: " + ", ".join(f"{word} {count}" for word, count in sorted(counts["reason"].items())))
+    asked = counts["exposure"]
+    if asked and asked["factor"] < _WORTH_SAYING:
+        print(
+            f"lights overexposed in {asked['too_bright']} of {asked['frames']} frames: "
+            f"shorten the exposure to about x{asked['factor']:.2g}"
+        )
 
 
 @app.command(

@@ -27,7 +27,7 @@ _WHY = {
     "inconsistent": "the detections fit no assignment to the dock's lights",
     "residual": "the identified detections do not lie where any one pose puts their lights",
     "protection": "a pose was found, but its protection level is over the alert limit",
-    "saturated": "as protection, and the lights are overexposed: a shorter exposure helps",
+    "saturated": "the lights show too little and are overexposed: a shorter exposure helps",
     "calibration": "the detections contradict the camera calibration",
     "survey": "the detections contradict the positions in the station file",
     "stale": "no light was detected for too long to go on predicting",

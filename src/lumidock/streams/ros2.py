@@ -40,6 +40,7 @@ float64 range_m              # its distance
 float64 pl_bearing_rad       # what the bearing's error exceeds once in 1e6 frames
 float64 pl_range_m           # the same of the range
 float64 latency_s            # from the frame to the fix, decoding excluded
+float64 exposure_factor      # by what exposure times gain should be multiplied; below 1 too bright
 """
 _DEFINITIONS = {
     "lumidock_msgs/msg/Status": STATUS_MSG,
@@ -181,7 +182,12 @@ def _status(fix: Fix, t_ns: int, latency_us: int | None, frames: _Frames) -> Any
     latency_s = nan if latency_us is None else latency_us * 1e-6
     words = (fix.valid, guide is not None, fix.status, fix.stage, fix.reason, fix.n_seen, fix.n_used)
     return _make(
-        "lumidock_msgs/msg/Status", _header(t_ns, frames.dock), *words, *map(float, (*numbers, *bearing)), latency_s
+        "lumidock_msgs/msg/Status",
+        _header(t_ns, frames.dock),
+        *words,
+        *map(float, (*numbers, *bearing)),
+        latency_s,
+        fix.exposure_factor,
     )
 
 

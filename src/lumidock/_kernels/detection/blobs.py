@@ -18,6 +18,8 @@ COLUMNS = 12
 _RINGS, _SPOKES = (5.0, 8.0), 16  # radii over the filter's size; a blob of its own size has 2 % of its height there
 _SIGMA = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 LEFT, TOP, RIGHT, BOTTOM, U0, V0, CORE_LEFT, CORE_TOP, CORE_RIGHT, CORE_BOTTOM = range(10)
+SEEN_LEFT, SEEN_TOP, SEEN_RIGHT, SEEN_BOTTOM = range(10, 14)
+PATCH_COLUMNS = 14
 
 
 @entry
@@ -53,8 +55,8 @@ def maxima(
     """Append the 3 x 3 maxima of `response` (H, W, P) to `found`; returns the new count.
 
     A maximum must exceed `least` (P,) and `clear` times the texture around it, and have a ratio of its curvatures over
-    `roundness`. `patches` (N, 10), rectangles of the canvas in pixels of the frame, are searched from `first` to
-    `last`; a maximum counts where it lies in the core of one.
+    `roundness`. `patches` (N, PATCH_COLUMNS), rectangles of the canvas in pixels of the frame, are searched from
+    `first` to `last`; a maximum counts where it lies in the core of one.
     """
     height, width, planes = response.shape
     away = np.empty(2 * _SPOKES)
@@ -81,8 +83,7 @@ def maxima(
                     half_trace, root = 0.5 * (h_xx + h_yy), np.hypot(0.5 * (h_xx - h_yy), h_xy)
                     if half_trace + root > roundness * (half_trace - root):  # both are negative at a maximum
                         continue
-                    box = (patch[LEFT] // pixel, patch[TOP] // pixel, patch[RIGHT] // pixel, patch[BOTTOM] // pixel)
-                    around = _texture(response, p, x, y, scale, box, away)
+                    around = _texture(response, p, x, y, scale, limits(patch, pixel), seen_limits(patch, pixel), away)
                     if r <= clear * around:
                         continue
                     row = found[count]
@@ -97,20 +98,45 @@ def maxima(
 
 
 @part
+def limits(patch: Indices, pixel: int) -> tuple[int, int, int, int]:
+    """First and last column and row of a patch on a level whose pixels are so large: left, top, right, bottom."""
+    return patch[LEFT] // pixel, patch[TOP] // pixel, patch[RIGHT] // pixel - 1, patch[BOTTOM] // pixel - 1
+
+
+@part
+def seen_limits(patch: Indices, pixel: int) -> tuple[int, int, int, int]:
+    """The same of the part of a patch that is in the frame."""
+    right, bottom = max(patch[SEEN_RIGHT] // pixel, 1) - 1, max(patch[SEEN_BOTTOM] // pixel, 1) - 1
+    return min(patch[SEEN_LEFT] // pixel, right), min(patch[SEEN_TOP] // pixel, bottom), right, bottom
+
+
+@part
 def _texture(
-    response: Array, p: int, x: int, y: int, scale: float, box: tuple[int, int, int, int], away: Array
+    response: Array,
+    p: int,
+    x: int,
+    y: int,
+    scale: float,
+    box: tuple[int, int, int, int],
+    seen: tuple[int, int, int, int],
+    away: Array,
 ) -> float:
-    """The noise of a response around a maximum: from the median absolute value on two rings, outside of its own."""
+    """The noise of a response around a maximum: from the median absolute value on two rings, outside of its own.
+
+    What lies beyond the frame, where a lamp at the border has its mirror image, does not count.
+    """
     count = 0
     for ring in _RINGS:
         for k in range(_SPOKES):
             angle = 2.0 * math.pi * k / _SPOKES
-            i = min(max(x + round(ring * scale * math.cos(angle)), box[0]), box[2] - 1)
-            j = min(max(y + round(ring * scale * math.sin(angle)), box[1]), box[3] - 1)
+            i, j = x + round(ring * scale * math.cos(angle)), y + round(ring * scale * math.sin(angle))
+            i, j = min(max(i, box[0]), box[2]), min(max(j, box[1]), box[3])
+            if i < seen[0] or i > seen[2] or j < seen[1] or j > seen[3]:
+                continue
             value, at = abs(response[j, i, p]), count
             while at > 0 and away[at - 1] > value:
                 away[at] = away[at - 1]
                 at -= 1
             away[at] = value
             count += 1
-    return float(_SIGMA * 0.5 * (away[_SPOKES - 1] + away[_SPOKES]))
+    return float(_SIGMA * 0.5 * (away[(count - 1) // 2] + away[count // 2])) if count else 0.0

@@ -7,7 +7,17 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from lumidock._kernels.detection.blobs import CORE_BOTTOM, CORE_LEFT, CORE_RIGHT, CORE_TOP
+from lumidock._kernels.detection.blobs import (
+    CORE_BOTTOM,
+    CORE_LEFT,
+    CORE_RIGHT,
+    CORE_TOP,
+    PATCH_COLUMNS,
+    SEEN_BOTTOM,
+    SEEN_LEFT,
+    SEEN_RIGHT,
+    SEEN_TOP,
+)
 from lumidock.datatypes import Array, Image, Indices
 
 _LEAST_WIDTH_PX = 512  # of the picture; more where a part is wider
@@ -16,15 +26,17 @@ _LEAST_WIDTH_PX = 512  # of the picture; more where a part is wider
 class Canvas(NamedTuple):
     """`levels` (H, W, P) of a pyramid of 2 x 2 means, the first of them level `base`, and its `patches`.
 
-    Blobs are searched from level `first` on; finer ones serve to measure them. `patches` (N, 10), columns of `blobs`:
-    left, top, right and bottom on the canvas, u and v of the frame at its left top pixel, and the core of the patch on
-    the canvas, in which blobs count; all in pixels of level 0.
+    Blobs are searched from level `first` on; finer ones serve to measure them. `patches` (N, PATCH_COLUMNS), columns of
+    `blobs`: left, top, right and bottom on the canvas, u and v of the frame at its left top pixel, the core of the
+    patch on the canvas, in which blobs count, and the part of it that is in the frame; all in pixels of level 0. The
+    last `unsearched` of the patches serve to measure the noise; where there are none, all patches do.
     """
 
     base: int
     first: int
     levels: list[Array]
     patches: Indices
+    unsearched: int = 0
 
 
 def halved(image: Array) -> Array:
@@ -33,10 +45,13 @@ def halved(image: Array) -> Array:
     return np.asarray(small.reshape(small.shape[0], small.shape[1], -1), np.float32)
 
 
-def canvas(image: Image, given: int, cores: Indices, margin: int, levels: tuple[int, int]) -> Canvas:
+def canvas(
+    image: Image, given: int, cores: Indices, margin: int, levels: tuple[int, int], unsearched: int = 0
+) -> Canvas:
     """Cut `cores` (N, 4: u0, v0, u1, v1) with `margin` px around them out of level `given` of a frame's pyramid.
 
-    `levels` are the first and the last that are made. Beyond the border the frame is mirrored.
+    `levels` are the first and the last that are made; the last `unsearched` of the cores serve to measure the noise.
+    Beyond the border the frame is mirrored.
     """
     base, top = levels
     pixel = 1 << top
@@ -44,6 +59,7 @@ def canvas(image: Image, given: int, cores: Indices, margin: int, levels: tuple[
     outer[:, :2] = (cores[:, :2] - margin) // pixel * pixel
     outer[:, 2:] = -(-(cores[:, 2:] + margin) // pixel) * pixel
     patches, width, height = _packed(outer, cores)
+    _mark_seen(patches, image.shape[1] << given, image.shape[0] << given)
     small = 1 << base
     planes = 3 if image.ndim == 3 else 1
     room = np.zeros((height // small, width // small, planes), np.float32)
@@ -54,14 +70,14 @@ def canvas(image: Image, given: int, cores: Indices, margin: int, levels: tuple[
     pyramid = [room]
     for _ in range(base, top):
         pyramid.append(halved(pyramid[-1]))
-    return Canvas(base, base, pyramid, patches)
+    return Canvas(base, base, pyramid, patches, unsearched)
 
 
 def _packed(outer: Indices, cores: Indices) -> tuple[Indices, int, int]:
     """Places of rectangles on shelves, the highest first; width and height of the canvas."""
     size = outer[:, 2:] - outer[:, :2]
     width = max(_LEAST_WIDTH_PX, int(size[:, 0].max(initial=0)))
-    patches = np.zeros((len(outer), 10), np.int64)
+    patches = np.zeros((len(outer), PATCH_COLUMNS), np.int64)
     x, y, shelf = 0, 0, 0
     for k in np.argsort(-size[:, 1], kind="stable"):
         w, h = (int(side) for side in size[k])
@@ -74,6 +90,14 @@ def _packed(outer: Indices, cores: Indices) -> tuple[Indices, int, int]:
     patches[:, CORE_LEFT], patches[:, CORE_TOP] = (cores[:, :2] + shift).T
     patches[:, CORE_RIGHT], patches[:, CORE_BOTTOM] = (cores[:, 2:] + shift).T
     return patches, width, y + shelf
+
+
+def _mark_seen(patches: Indices, width: int, height: int) -> None:
+    """Write which part of each patch is in a frame of this size."""
+    shift = patches[:, :2] - patches[:, 4:6]
+    low, high = patches[:, :2], patches[:, 2:4]
+    patches[:, [SEEN_LEFT, SEEN_TOP]] = np.maximum(low, shift)
+    patches[:, [SEEN_RIGHT, SEEN_BOTTOM]] = np.minimum(high, shift + np.array([width, height]))
 
 
 def _cut(image: Image, box: Indices, small: int) -> Image:

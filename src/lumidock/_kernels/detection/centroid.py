@@ -7,14 +7,16 @@ import math
 import numpy as np
 
 from lumidock._kernels.compiling import entry, part
-from lumidock._kernels.detection.blobs import BOTTOM, LEFT, LEVEL, PATCH, PLANE, RIGHT, SCALE, TOP, X, Y
+from lumidock._kernels.detection.blobs import LEVEL, PATCH, PLANE, SCALE, X, Y, limits, seen_limits
 from lumidock.datatypes import Array, Indices
 
 RATIO = math.sqrt(2.0)  # of the two standard deviations of a difference of Gaussians
+Limits = tuple[tuple[int, int, int, int], tuple[int, int, int, int]]  # of a patch, and of what is in the frame
+_START = 0.7  # sizes from the border, at least, where the search for a maximum begins; on the border it would end
 _REACH = 3.0  # standard deviations of the wider Gaussian that are summed: 1.1 % of its mass lies beyond
 _MOST = 35  # samples of a row at most: 2 * 3 * 2 * 1.27 * 2 + 1 at the widest filter, rounded up
 _STEPS = 6
-_GRADIENT_VAR = 13.0 / 12.0  # s^2 times the variance of the response's gradient over that of the response, white noise
+GRADIENT_VAR = 13.0 / 12.0  # s^2 times the variance of the response's gradient over that of the response, white noise
 M_X, M_Y, M_HEIGHT, M_XX, M_XY, M_YY, M_SHIFT_X, M_SHIFT_Y, M_SHIFTS, M_OK, M_RATIO = range(11)
 MEASURES = 11
 
@@ -26,16 +28,17 @@ def centroids(image: Array, patches: Indices, level: int, blobs: Array, out: Arr
     `out` (N, MEASURES): position in level pixels, height of the response, covariance that noise of 1 in the response
     leaves, squared level pixels, and how far the maximum moves to the filters `RATIO` finer and wider.
     """
-    weights = np.empty((2, 6, _MOST))
+    weights = np.empty((2, 9, _MOST))
     value = np.empty(6)
     for n in range(len(blobs)):
         blob, patch = blobs[n], patches[int(blobs[n, PATCH])]
         if int(blob[LEVEL]) != level:
             continue
         pixel = 1 << level
-        box = (patch[LEFT] // pixel, patch[TOP] // pixel, patch[RIGHT] // pixel - 1, patch[BOTTOM] // pixel - 1)
+        box = limits(patch, pixel), seen_limits(patch, pixel)
         p, s, row = int(blob[PLANE]), blob[SCALE], out[n]
-        row[M_X], row[M_Y] = blob[X], blob[Y]
+        row[M_X] = _inside(blob[X], box[1][0], box[1][2], _START * s)
+        row[M_Y] = _inside(blob[Y], box[1][1], box[1][3], _START * s)
         row[M_OK] = _climb(image, p, s, box, weights, value, row)
         row[M_HEIGHT] = value[0]
         _covariance_of_noise(value, s, row)
@@ -52,7 +55,7 @@ def centroids(image: Array, patches: Indices, level: int, blobs: Array, out: Arr
 @part
 def _covariance_of_noise(value: Array, s: float, row: Array) -> None:
     """Write H^-1 G H^-1, where G is the covariance that the gradient has for response noise of 1."""
-    g = _GRADIENT_VAR / (s * s)
+    g = GRADIENT_VAR / (s * s)
     h_xx, h_xy, h_yy = value[3], value[4], value[5]
     det = h_xx * h_yy - h_xy * h_xy
     if det <= 0.0 or h_xx >= 0.0:
@@ -72,7 +75,7 @@ def _climb(
     image: Array,
     p: int,
     s: float,
-    box: tuple[int, int, int, int],
+    box: Limits,
     weights: Array,
     value: Array,
     row: Array,
@@ -104,11 +107,14 @@ def _respond(
     s: float,
     x: float,
     y: float,
-    box: tuple[int, int, int, int],
+    box: Limits,
     weights: Array,
     value: Array,
 ) -> None:
-    """Write the response, its gradient (x, y) and Hessian (xx, xy, yy) at a place; beyond the box it is mirrored."""
+    """Write the response, its gradient (x, y) and Hessian (xx, xy, yy) at a place.
+
+    Beyond the frame a light goes on as it is on the other side of the place, and beyond the patch it is mirrored.
+    """
     reach = min(math.ceil(_REACH * RATIO * s), _MOST // 2)
     left, top = round(x) - reach, round(y) - reach
     side = 2 * reach + 1
@@ -128,12 +134,19 @@ def _respond(
                 weights[axis, 3 * k, i] = g
                 weights[axis, 3 * k + 1, i] = g * t / sigma
                 weights[axis, 3 * k + 2, i] = g * (t * t - 1.0) / (sigma * sigma)
+        _find_samples(left if axis == 0 else top, side, x if axis == 0 else y, axis, box, weights[axis])
     value[:] = 0.0
     for j in range(side):
-        v = mirrored(top + j, box[1], box[3])
+        v0, v1, dv = int(weights[1, 6, j]), int(weights[1, 7, j]), weights[1, 8, j]
         a0 = a1 = a2 = b0 = b1 = b2 = 0.0
         for i in range(side):
-            sample = plane_value(image, p, v, mirrored(left + i, box[0], box[2]))
+            u0, du = int(weights[0, 6, i]), weights[0, 8, i]
+            sample = plane_value(image, p, v0, u0)
+            if du > 0.0 or dv > 0.0:
+                u1 = int(weights[0, 7, i])
+                upper = (1.0 - du) * sample + du * plane_value(image, p, v0, u1)
+                lower = (1.0 - du) * plane_value(image, p, v1, u0) + du * plane_value(image, p, v1, u1)
+                sample = (1.0 - dv) * upper + dv * lower
             a0 += weights[0, 0, i] * sample
             a1 += weights[0, 1, i] * sample
             a2 += weights[0, 2, i] * sample
@@ -155,6 +168,30 @@ def plane_value(image: Array, p: int, v: int, u: int) -> float:
     if p < image.shape[2]:
         return image[v, u, p]
     return (image[v, u, 0] + image[v, u, 1] + image[v, u, 2]) * np.float32(1.0 / 3.0)
+
+
+@part
+def _inside(x: float, low: int, high: int, margin: float) -> float:
+    """A coordinate at least so far from the limits, or in their middle."""
+    middle = 0.5 * (low + high)
+    return min(max(x, min(low - 0.5 + margin, middle)), max(high + 0.5 - margin, middle))
+
+
+@part
+def _find_samples(first: int, side: int, center: float, axis: int, box: Limits, weights: Array) -> None:
+    """Write which two columns or rows each sample lies between, and how far from the first, to rows 6 to 8.
+
+    One beyond the frame is taken from the other side of the centre, if that is in the frame.
+    """
+    patch, seen = box
+    for i in range(side):
+        at = float(first + i)
+        if not seen[axis] <= at <= seen[axis + 2] and seen[axis] <= 2.0 * center - at <= seen[axis + 2]:
+            at = 2.0 * center - at
+        whole = math.floor(at)
+        weights[6, i] = mirrored(whole, patch[axis], patch[axis + 2])
+        weights[7, i] = mirrored(whole + 1, patch[axis], patch[axis + 2])
+        weights[8, i] = at - whole
 
 
 @part

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from lumidock._kernels.compiling import entry, part
-from lumidock._kernels.detection.blobs import BOTTOM, LEFT, LEVEL, PATCH, RIGHT, SCALE, TOP
+from lumidock._kernels.detection.blobs import LEVEL, PATCH, SCALE, limits, seen_limits
 from lumidock._kernels.detection.centroid import mirrored, plane_value
 from lumidock.datatypes import Array, Indices
 
@@ -19,27 +19,34 @@ MEAN, SPREAD, MOST = range(3)
 def rings(image: Array, patches: Indices, level: int, blobs: Array, xy: Array, out: Array) -> None:
     """Write mean, standard deviation and largest sample of the rings around the blobs of one level of the pyramid.
 
-    `image` (H, W, P), `xy` (N, 2) centroids in level pixels, `out` (N, 3, P, RINGS).
+    `image` (H, W, P), `xy` (N, 2) centroids in level pixels, `out` (N, 3, P, RINGS). Samples beyond the frame do not
+    count: there a lamp at the border has its mirror image.
     """
     for n in range(len(blobs)):
         if int(blobs[n, LEVEL]) != level:
             continue
         patch, pixel = patches[int(blobs[n, PATCH])], 1 << level
-        box = (patch[LEFT] // pixel, patch[TOP] // pixel, patch[RIGHT] // pixel - 1, patch[BOTTOM] // pixel - 1)
+        box, seen = limits(patch, pixel), seen_limits(patch, pixel)
         for k in range(RINGS):
             for p in range(out.shape[2]):
-                total, squares, most = 0.0, 0.0, -np.inf
+                total, squares, most, count = 0.0, 0.0, -np.inf, 0
                 for i in range(SPOKES):
                     angle = 2.0 * math.pi * (i + 0.5 * (k % 2)) / SPOKES
                     x = xy[n, 0] + k * STEP * blobs[n, SCALE] * math.cos(angle)
                     y = xy[n, 1] + k * STEP * blobs[n, SCALE] * math.sin(angle)
+                    if k > 0 and not (seen[0] <= x <= seen[2] and seen[1] <= y <= seen[3]):
+                        continue
                     sample = _sample(image, p, x, y, box)
+                    count += 1
                     total += sample
                     squares += sample * sample
                     most = max(most, sample)
-                mean = total / SPOKES
+                if count == 0:  # a ring that is beyond the frame is as the one within
+                    out[n, :, p, k] = out[n, :, p, k - 1]
+                    continue
+                mean = total / count
                 out[n, MEAN, p, k] = mean
-                out[n, SPREAD, p, k] = math.sqrt(max(squares / SPOKES - mean * mean, 0.0))
+                out[n, SPREAD, p, k] = math.sqrt(max(squares / count - mean * mean, 0.0))
                 out[n, MOST, p, k] = most
 
 
