@@ -168,6 +168,7 @@ class Worker(threading.Thread):
         super().__init__(name=name, daemon=True)
         self._open, self._queue, self._stale_s = open_sink, deque[Done](maxlen=queue), stale_s
         self._pictures, self._patient = pictures, patient
+        self._skipped = deque[Fix](maxlen=_RECENT)  # fixes that were not sent, of which a sink may want to know
         self._changed, self._halt = threading.Condition(), False
         self.tried = threading.Event()  # whether the sink has been opened, well or not
         self.sent, self.dropped, self.stale, self.errors, self.problem = 0, 0, 0, 0, ""
@@ -176,7 +177,9 @@ class Worker(threading.Thread):
     def offer(self, done: Done) -> None:
         """Queue a fix, in place of the oldest where the queue is full; never waits."""
         with self._changed:
-            self.dropped += len(self._queue) == self._queue.maxlen
+            if len(self._queue) == self._queue.maxlen:
+                self.dropped += 1
+                self._skipped.append(self._queue[0].fix)
             self._queue.append(done if self._pictures else _without_picture(done))
             self._changed.notify()
 
@@ -237,11 +240,20 @@ class Worker(threading.Thread):
         age_s = time.monotonic() - done.taken.at_s
         if self._stale_s is not None and age_s > self._stale_s:
             self.stale += 1
+            self._skipped.append(done.fix)
             return
+        self._tell_skipped(sink)
         sink.add(done.taken.item, done.fix, done.latency_us)
         self.sent += 1
         self.problem = ""
         self.delay_s.append(time.monotonic() - done.taken.at_s)
+
+
+    def _tell_skipped(self, sink: Sink) -> None:
+        """Let a sink that counts acquisitions take notice of fixes that it was not given."""
+        skip: Callable[[Fix], None] = getattr(sink, "skip", lambda _fix: None)
+        while self._skipped:
+            skip(self._skipped.popleft())
 
 
 @dataclass(slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import signal
 import sys
@@ -73,7 +74,25 @@ LiveSource = Annotated[
 ]
 MavlinkOption = Annotated[
     str | None,
-    typer.Option("--mavlink", metavar="HOST:PORT", help="Send VISION_POSITION_ESTIMATE by UDP; needs --vehicle."),
+    typer.Option("--mavlink", metavar="HOST:PORT", help="Send poses, bearing and range by UDP; needs --vehicle."),
+]
+MavlinkId = Annotated[
+    str,
+    typer.Option("--mavlink-id", metavar="SYSTEM[:COMPONENT]", help="Who speaks; the system is the autopilot's."),
+]
+MavlinkKey = Annotated[
+    Path | None,
+    typer.Option("--mavlink-key", metavar="FILE", help="Sign with the passphrase in the first line of FILE."),
+]
+MavlinkHeading = Annotated[
+    float | None,
+    typer.Option(
+        "--mavlink-heading",
+        metavar="DEG",
+        min=-180.0,
+        max=360.0,
+        help="Compass heading of a vehicle that faces the dock head-on: the local frame is then north, east, down.",
+    ),
 ]
 ZenohOption = Annotated[
     str | None,
@@ -119,6 +138,9 @@ def _serve(
     config: ConfigOption = None,
     loop: Annotated[bool, typer.Option("--loop", help="Show a recording again and again.")] = False,
     mavlink: MavlinkOption = None,
+    mavlink_id: MavlinkId = "1:197",
+    mavlink_key: MavlinkKey = None,
+    mavlink_heading: MavlinkHeading = None,
     zenoh: ZenohOption = None,
     dds: Annotated[bool, typer.Option("--dds", help="Publish to ROS 2 by DDS.")] = False,
     domain: Annotated[int, typer.Option(metavar="N", min=0, max=232, help="ROS_DOMAIN_ID.")] = 0,
@@ -148,7 +170,8 @@ def _serve(
         tell((*opened.notes, *calibration.warnings))
         setting = Setting(load_station(station_file), calibration.camera, mounting)
         sinks = [
-            *_vehicle_sinks(setting, mavlink, zenoh, domain if dds else None, domain, host),
+            *_mavlink_sinks(setting, mavlink, mavlink_id, mavlink_key, mavlink_heading),
+            *_ros_sinks(setting, zenoh, domain if dds else None, domain, host),
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
         ]
         server = _server(opened, _ready_localizer(method, setting, settings), setting.camera, sinks, loop=loop)
@@ -210,19 +233,31 @@ def _stopped_by_signals(stop: threading.Event) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _vehicle_sinks(
-    setting: Setting, mavlink: str | None, zenoh: str | None, dds: int | None, domain: int, host: str
+def _mavlink_sinks(
+    setting: Setting, mavlink: str | None, who: str, key: Path | None, heading_deg: float | None
 ) -> list[Worker]:
+    if mavlink is None:
+        return []
+    if setting.vehicle is None:
+        raise InputError("--mavlink needs --vehicle FILE: an autopilot wants the pose of the vehicle's body")
+    with extra("mavlink"):
+        from lumidock.streams.mavlink import Identity, Mavlink, ResetCounter, signing_key
+    name, port = _host_and_port("--mavlink", mavlink)
+    system, _, component = who.partition(":")
+    if not all(word.isdecimal() and 0 < int(word) < 256 for word in (system, component or "197")):
+        raise InputError(f"--mavlink-id {who}: wanted SYSTEM or SYSTEM:COMPONENT, each from 1 to 255")
+    identity = Identity(
+        int(system),
+        int(component or "197"),
+        math.radians(heading_deg or 0.0),
+        signing_key(key) if key is not None else None,
+    )
+    link = partial(Mavlink, name, port, setting.vehicle, identity, ResetCounter())
+    return [Worker("mavlink", link, queue=1, stale_s=STALE_S, pictures=False)]
+
+
+def _ros_sinks(setting: Setting, zenoh: str | None, dds: int | None, domain: int, host: str) -> list[Worker]:
     workers, shared = [], (setting.camera, setting.vehicle, setting.station.ids)
-    if mavlink is not None:
-        if setting.vehicle is None:
-            raise InputError("--mavlink needs --vehicle FILE: an autopilot wants the pose of the vehicle's body")
-        with extra("mavlink"):
-            from lumidock.streams.mavlink import Mavlink
-        name, port = _host_and_port("--mavlink", mavlink)
-        workers.append(
-            Worker("mavlink", partial(Mavlink, name, port, setting.vehicle), queue=1, stale_s=STALE_S, pictures=False)
-        )
     if zenoh is not None:
         if not _ENDPOINT.fullmatch(zenoh):
             raise InputError(f"--zenoh {zenoh}: wanted an endpoint, as tcp/127.0.0.1:7447 is one")
