@@ -57,13 +57,11 @@ def estimate(link: common.MAVLink, fix: Fix, frames: Frames, resets: int) -> com
     if velocity is None:
         return link.vision_position_estimate_encode(usec, *place, *angles, covariance, resets)
     x, y, z, w = map(float, quat_xyzw_from_rotation(R))
-    moving, moving_covariance = _velocity(velocity)
+    motion, motion_covariance = _motion(velocity)
     axes = common.MAV_FRAME_LOCAL_FRD, common.MAV_FRAME_BODY_FRD
-    rates = (_UNKNOWN,) * 3
     kind = common.MAV_ESTIMATOR_TYPE_VISION
-    pose = (*place, (w, x, y, z))
-    covariances = covariance, moving_covariance
-    return link.odometry_encode(usec, *axes, *pose, *moving, *rates, *covariances, resets, kind)
+    pose, covariances = (*place, (w, x, y, z)), (covariance, motion_covariance)
+    return link.odometry_encode(usec, *axes, *pose, *motion, *covariances, resets, kind)
 
 
 def _microseconds(fix: Fix) -> int:
@@ -80,12 +78,12 @@ def _pose_covariance(
     return [float(value) for value in full[np.triu_indices(6)]]
 
 
-def _velocity(velocity: BodyVelocity) -> tuple[tuple[float, ...], list[float]]:
-    """Velocity in aerospace axes and the upper triangle of its covariance, in which rates of turn are unknown."""
-    full = np.full((6, 6), _UNKNOWN)
-    full[:3, :3] = _R_BODY_AERO @ velocity.covariance @ _R_BODY_AERO
-    moving = tuple(map(float, _R_BODY_AERO @ velocity.linear_m_s))
-    return moving, [float(value) for value in full[np.triu_indices(6)]]
+def _motion(velocity: BodyVelocity) -> tuple[tuple[float, ...], list[float]]:
+    """Velocity and turn rate in aerospace axes, and the upper triangle of their covariance."""
+    turn = np.kron(np.eye(2), _R_BODY_AERO)
+    motion = turn @ np.concatenate([velocity.linear_m_s, velocity.angular_rad_s])
+    covariance = turn @ velocity.covariance @ turn.T
+    return tuple(map(float, motion)), [float(value) for value in covariance[np.triu_indices(6)]]
 
 
 def landing_target(link: common.MAVLink, fix: Fix, guide: Guide, frames: Frames) -> common.MAVLink_message:
