@@ -108,7 +108,7 @@ def test_foxgloves_decoders_read_our_mcap(made):
     assert found["/lumidock/image/compressed"][0]["content"]["data"][:2] == [0xFF, 0xD8]
     names = {text["text"] for line in found["/lumidock/annotations"] for text in line["content"]["texts"]}
     assert names == set("ABCDE")
-    assert found["/tf_static"][0]["content"]["transforms"][0]["child_frame_id"] == "base_link"
+    assert found["/tf"][0]["content"]["transforms"][0]["child_frame_id"] == "dock"
 
 
 def test_rerun_reads_our_mcap_and_verifies_our_rrd(made, tmp_path):
@@ -265,7 +265,7 @@ def test_foxglove_connects_to_a_server(made):
         served.communicate()
     assert found["/lumidock/pose"]["header"]["frame_id"] == "dock"
     assert found["/lumidock/image/compressed"]["format"] == "jpeg"
-    assert len(found) == 7
+    assert "/detected_dock_pose" in found
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from zenoh.ext import Int64, z_serialize
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
-from lumidock.streams import ros2
+from lumidock.streams import ros2, rostypes
 from lumidock.streams.vehicle import Vehicle
 
 _NODE = "lumidock"
@@ -47,15 +47,15 @@ class ZenohLink:
             self._session = zenoh.open(config)
         except zenoh.ZError:
             raise OSError(f"{endpoint}: not an endpoint of zenoh, as tcp/127.0.0.1:7447 is one") from None
-        self._camera, self._vehicle, self._light_ids = camera, vehicle, light_ids
+        self._publication = ros2.Publication(camera, vehicle, light_ids)
         self._id = str(self._session.zid())
         self._gid = bytes.fromhex(self._id.rjust(32, "0"))
         self._publishers, self._sequence = dict[str, zenoh.Publisher](), 0
         liveliness = self._session.liveliness()
         self._tokens = [liveliness.declare_token(f"@ros2_lv/{domain}/{self._id}/0/0/NN/%/%/{_NODE}")]
-        for number, (topic, kind) in enumerate(ros2.TYPES.items(), start=1):
-            name, place = dds_name(kind), topic.replace("/", "%")
-            typed = f"{name}/{ros2.type_hash(kind)}"
+        for number, (topic, kind) in enumerate(rostypes.TYPES.items(), start=1):
+            name, place = rostypes.dds_name(kind), topic.replace("/", "%")
+            typed = f"{name}/{rostypes.type_hash(kind)}"
             self._publishers[topic] = self._session.declare_publisher(
                 f"{domain}/{topic.lstrip('/')}/{typed}", congestion_control=zenoh.CongestionControl.DROP
             )
@@ -64,12 +64,10 @@ class ZenohLink:
 
     def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
         """Publish one frame."""
-        if self._vehicle is not None and item.t_ns is not None:
-            self._put(ros2.mounting(self._vehicle, item.t_ns))
-        for message in ros2.messages(item, fix, latency_us, self._camera, self._vehicle, self._light_ids):
+        for message in self._publication.messages(item, fix, latency_us):
             self._put(message)
 
-    def _put(self, message: ros2.Serialized) -> None:
+    def _put(self, message: rostypes.Serialized) -> None:
         self._sequence += 1
         attachment = z_serialize((Int64(self._sequence), Int64(time.time_ns()), self._gid))
         self._publishers[message.topic].put(message.data, attachment=attachment)
@@ -77,9 +75,3 @@ class ZenohLink:
     def close(self) -> None:
         """Part from the network."""
         self._session.close()
-
-
-def dds_name(message_type: str) -> str:
-    """The name of a type in DDS: geometry_msgs::msg::dds_::Pose_."""
-    package, _, name = message_type.split("/")
-    return f"{package}::msg::dds_::{name}_"
