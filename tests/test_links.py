@@ -1,15 +1,11 @@
 """Fixes over zenoh and DDS, as another session of the same libraries gets them; foreign clients are in test_peers."""
 
-import json
 import platform
 import re
-import socket
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import zenoh
 from commandline import AHEAD, wait_for
 from conftest import assert_close
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -18,8 +14,8 @@ from zenoh.ext import Int64, z_deserialize
 
 from lumidock.datatypes import Fix, Frame
 from lumidock.streams import rostypes
-from lumidock.streams.vehicle import Vehicle
 from lumidock.streams.rostypes import dds_name
+from lumidock.streams.vehicle import Vehicle
 from lumidock.streams.zenohlink import ZenohLink
 
 T = np.diag([1.0, -1, -1, 1])
@@ -27,23 +23,6 @@ T[:3, 3] = [0.25, -0.5, 6.0]
 FIX = Fix("a", 1_700_000_000_123_456_789, "tracking", "rear", 3, 3, T, covariance=np.eye(6) * 0.01)
 MOUNTED = Vehicle(AHEAD, mounting_transform=True)
 FRAME = Frame("a", FIX.t_ns, np.zeros((256, 320), np.uint8))
-
-
-@pytest.fixture
-def router():
-    """A zenoh session that listens on this machine, as a router would, and what it receives by key."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    config = zenoh.Config()
-    for key, value in {
-        "mode": "router",
-        "listen/endpoints": [endpoint],
-        "scouting/multicast/enabled": False,
-    }.items():
-        config.insert_json5(key, json.dumps(value))
-    with zenoh.open(config) as session:
-        yield SimpleNamespace(session=session, endpoint=endpoint)
 
 
 def test_ros2_messages_go_over_zenoh(router):

@@ -211,7 +211,7 @@ def test_without_a_velocity_no_odometry_says_that_the_vehicle_stands(velocity):
 def test_with_a_heading_the_local_frame_is_north_east_down():
     fix = Fix("a", 0, "tracking", "rear", T_dock_cam=HEAD_ON)
     message = estimate(common.MAVLink(None), fix, Frames.of(Vehicle(AHEAD), math.radians(90.0)), 0)
-    # head-on the vehicle looks east; it stands 6.8 m before the dock, which is west of it, and 0.3 m right, which is south
+    # head-on the vehicle looks east; it is 6.8 m west of the dock, and 0.3 m right of its middle, which is south
     assert_close([message.x, message.y, message.z], [-0.3, -6.8, -0.1], atol=1e-6)
     assert_close([message.roll, message.pitch, message.yaw], [0, 0, math.pi / 2], atol=1e-6)
 
@@ -241,12 +241,11 @@ def test_named_values_are_bearings_and_range(listener):
     link.close()
 
 
-def test_signed_messages_are_accepted_with_the_key_alone(listener, tmp_path):
+def test_signed_messages_are_accepted_with_the_key_alone(tmp_path):
     (tmp_path / "key").write_text("correct horse battery\nand more\n")
     key = signing_key(tmp_path / "key")
     assert key == hashlib.sha256(b"correct horse battery").digest()
     assert "horse" not in repr(Identity(key=key))
-    received = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
         port.bind(("127.0.0.1", 0))
         port.settimeout(2)

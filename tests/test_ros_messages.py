@@ -28,9 +28,7 @@ def published(fix, vehicle=None, publication=None):
     frame = Frame("a", fix.t_ns, np.zeros((256, 320), np.uint8))
     found = {}
     for message in publication.messages(frame, fix, 900, picture=False):
-        found.setdefault(message.topic, []).append(
-            typestore().deserialize_cdr(message.data, TYPES[message.topic])
-        )
+        found.setdefault(message.topic, []).append(typestore().deserialize_cdr(message.data, TYPES[message.topic]))
     return found
 
 
@@ -51,7 +49,8 @@ def test_no_frame_has_two_parents(way, mounting):
     vehicle = Vehicle(AHEAD, transform=way, mounting_transform=mounting)
     found = published(fix_of(HEAD_ON), vehicle)
     told = [t for topic in ("/tf", "/tf_static") for m in found.get(topic, []) for t in m.transforms]
-    urdf = [] if mounting or way == "dock_to_camera" else [("base_link", "camera_link"), ("camera_link", "camera_optical")]
+    urdf = [("base_link", "camera_link"), ("camera_link", "camera_optical")]
+    urdf = [] if mounting or way == "dock_to_camera" else urdf
     edges = [(t.header.frame_id, t.child_frame_id) for t in told] + urdf
     children = [child for _, child in edges]
     assert len(children) == len(set(children))
@@ -141,6 +140,6 @@ def test_diagnostics_come_once_a_second_and_tell_what_is_wrong():
     for k, t_ns in zip(range(30), count(0, SECOND // 10), strict=False):
         status, reason = fixes[k // 10]
         fix = Fix("a", t_ns, status, "front", T_dock_cam=None if reason else HEAD_ON, reason=reason)
-        for message in published(fix, publication=publication).get("/diagnostics", []):
-            levels.append((message.status[0].level, message.status[0].message))
+        told = published(fix, publication=publication).get("/diagnostics", [])
+        levels += [(message.status[0].level, message.status[0].message) for message in told]
     assert levels == [(1, "no lights"), (0, "pose"), (2, "bad frame")]

@@ -92,6 +92,8 @@ class SourceReader(threading.Thread):
                 self.problem = "the stream ended" if self._live and not self._halt.is_set() else ""
             except (LumidockError, OSError) as error:
                 self.problem = str(error)
+            except Exception as error:  # of a library's reader: told, and tried again like any other
+                self.problem = f"{type(error).__name__}: {' '.join(str(error).split())}"
             if not self._live and (not self._loop or self.problem):
                 break
             self._passes += 1
@@ -247,7 +249,6 @@ class Worker(threading.Thread):
         self.sent += 1
         self.problem = ""
         self.delay_s.append(time.monotonic() - done.taken.at_s)
-
 
     def _tell_skipped(self, sink: Sink) -> None:
         """Let a sink that counts acquisitions take notice of fixes that it was not given."""

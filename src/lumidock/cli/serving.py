@@ -57,7 +57,7 @@ from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
 from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, open_rerun
-from lumidock.streams.source import Reading, Source
+from lumidock.streams.source import Network, Reading, Source
 from lumidock.streams.vehicle import load_vehicle
 
 _LOOPBACK, _ENDPOINT = "127.0.0.1", re.compile(r"(tcp|udp|tls|quic)/[^/?#]+:[0-9]{1,5}")
@@ -69,7 +69,8 @@ LiveSource = Annotated[
     str,
     typer.Argument(
         metavar="SOURCE",
-        help="rtsp://..., rtp://HOST:PORT, /dev/videoN, gige:[NAME], sim:SCENARIO, or a recording at its own pace.",
+        help="rtsp://..., rtp://HOST:PORT, /dev/videoN, gige:[NAME], zenoh:/TOPIC, dds:/TOPIC, sim:SCENARIO, or a "
+        "recording at its own pace.",
     ),
 ]
 MavlinkOption = Annotated[
@@ -164,7 +165,8 @@ def _serve(
             source = str(simulated(source, folder / "sequence", station, camera))
         reading = Reading(fps, topic, info_topic, bits, as_stored=as_stored, trusted=trust_calibration)
         reading = replace(reading, follow_calibration=camera is None)
-        opened = open_any(source, reading, delay_ms=delay_ms, station=station)
+        network = Network(domain, host != _LOOPBACK)
+        opened = open_any(source, reading, delay_ms=delay_ms, station=station, network=network)
         station_file = file_of("station", station, opened.station, opened)
         calibration = calibration_of(camera, opened, name=camera_name, trusted=trust_calibration)
         tell((*opened.notes, *calibration.warnings))

@@ -47,6 +47,14 @@ def infos_for(
     raise InputError(f"{pictures}: no calibration beside it, and {', '.join(infos)} may be another camera's; {_OPTION}")
 
 
+def names_by_pictures(pictures: str) -> tuple[str, ...]:
+    """Where the calibration of pictures may be, by their name alone: beside them only where they are an image topic."""
+    names = tuple(_by_name(pictures))
+    return (
+        names if pictures.rpartition("/")[2].startswith("image") else tuple(n for n in names if n.startswith(pictures))
+    )
+
+
 def _by_name(pictures: str) -> list[str]:
     """The names that image_transport and the drivers use, the surest first."""
     space = _space(pictures)

@@ -64,7 +64,7 @@ class Publication:
         if picture and isinstance(item, Frame):
             yield serialized(f"{PREFIX}/camera_info", t_ns, rospicture.camera_info(self._camera, t_ns, self._cam))
             yield serialized(f"{PREFIX}/image/compressed", t_ns, rospicture.compressed(item, t_ns, self._cam))
-            yield serialized(f"{PREFIX}/annotations", t_ns, rospicture.annotations(fix, t_ns, self._light_ids))
+            yield serialized(f"{PREFIX}/annotations", t_ns, rospicture.rings(fix, t_ns, self._light_ids))
 
     def _pose(self, fix: Fix, T_dock_cam: Array, t_ns: int) -> Iterator[Serialized]:
         with_covariance = pose_with_covariance(T_dock_cam, fix.covariance)
@@ -89,9 +89,7 @@ class Publication:
             J[:3, 3:] = -skew(T_dock_body[:3, 3] - T_dock_cam[:3, 3])  # a rotation error moves what is away from cam
             covariance = J @ fix.covariance @ J.T
         where, head = pose_with_covariance(T_dock_body, covariance), header(t_ns, self._dock)
-        yield serialized(
-            f"{PREFIX}/body_pose", t_ns, make("geometry_msgs/msg/PoseWithCovarianceStamped", head, where)
-        )
+        yield serialized(f"{PREFIX}/body_pose", t_ns, make("geometry_msgs/msg/PoseWithCovarianceStamped", head, where))
         odometry = make("nav_msgs/msg/Odometry", head, vehicle.body_frame, where, _twist(fix, vehicle))
         yield serialized(f"{PREFIX}/odometry", t_ns, odometry)
 

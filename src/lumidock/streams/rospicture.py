@@ -38,7 +38,7 @@ def compressed(frame: Frame, t_ns: int, frame_id: str) -> Any:  # noqa: ANN401
     return make("sensor_msgs/msg/CompressedImage", header(t_ns, frame_id), "jpeg", data)
 
 
-def annotations(fix: Fix, t_ns: int, light_ids: tuple[str, ...]) -> Any:  # noqa: ANN401
+def rings(fix: Fix, t_ns: int, light_ids: tuple[str, ...]) -> Any:  # noqa: ANN401
     """A ring around each detection, and the name of its light. Foxglove counts pixels from the corner of the first."""
     circles, texts, time = [], [], time_of(t_ns)
     green, red, clear = (make("foxglove_msgs/msg/Color", *rgba) for rgba in (_IDENTIFIED, _SPURIOUS, _CLEAR))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 
 import zenoh
@@ -12,10 +11,10 @@ from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
 from lumidock.streams import ros2, rostypes
 from lumidock.streams.vehicle import Vehicle
+from lumidock.streams.zenohsession import is_connected, nobody_at, open_session, wait_for_router
 
 _NODE = "lumidock"
 _QOS = "::,10:,:,:,,"  # the defaults of ROS 2: reliable, volatile, the last ten
-_RETRY_MS = 1000
 
 
 class ZenohLink:
@@ -28,25 +27,7 @@ class ZenohLink:
 
         Raises: OSError for an endpoint that is none.
         """
-        config, settings = (
-            zenoh.Config(),
-            {
-                "mode": "peer",
-                "connect/endpoints": [endpoint],
-                "connect/timeout_ms": 0,
-                "connect/exit_on_failure": False,
-                "connect/retry": {"period_init_ms": _RETRY_MS, "period_max_ms": _RETRY_MS},
-                "listen/endpoints": [],
-                "scouting/multicast/enabled": False,
-                "scouting/gossip/enabled": False,
-            },
-        )
-        try:
-            for key, value in settings.items():
-                config.insert_json5(key, json.dumps(value))
-            self._session = zenoh.open(config)
-        except zenoh.ZError:
-            raise OSError(f"{endpoint}: not an endpoint of zenoh, as tcp/127.0.0.1:7447 is one") from None
+        self._endpoint, self._session = endpoint, open_session(endpoint)
         self._publication = ros2.Publication(camera, vehicle, light_ids)
         self._id = str(self._session.zid())
         self._gid = bytes.fromhex(self._id.rjust(32, "0"))
@@ -61,6 +42,12 @@ class ZenohLink:
             )
             token = f"@ros2_lv/{domain}/{self._id}/0/{number}/MP/%/%/{_NODE}/{place}/{typed}/{_QOS}"
             self._tokens.append(liveliness.declare_token(token))
+        wait_for_router(self._session)
+
+    @property
+    def problem(self) -> str:
+        """Why nobody receives what is published, where that is known."""
+        return "" if is_connected(self._session) else f"{nobody_at(self._endpoint)}; messages are dropped"
 
     def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
         """Publish one frame."""
