@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from lumidock.app.run import Setup, Summary
@@ -222,6 +224,16 @@ def test_frames_with_a_guide_are_counted():
         summary.count(fix, 1, "")
     counts = summary.as_dict()
     assert [counts[name] for name in ("frames", "valid", "guide", "guide_only")] == [4, 2, 2, 1]
+
+
+@given(st.lists(st.integers(0, 2000), min_size=1))
+def test_latencies_are_counted_and_their_percentiles_are_the_nearest_ranks(latencies):
+    summary = Summary()
+    for us in latencies:
+        summary.count(Fix("a", 0, "none", "search", reason="too_few"), us, "")
+    ranks = {"p50": 50, "p95": 95, "p99": 99, "max": 100}
+    wanted = {name: int(np.percentile(latencies, q, method="inverted_cdf")) for name, q in ranks.items()}
+    assert summary.as_dict()["latency_us"] == wanted
 
 
 def test_a_method_is_told_the_attitude_and_the_run_remembers_its_file(tmp_path):

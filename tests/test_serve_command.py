@@ -11,11 +11,16 @@ import urllib.request
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commandline import LUMIDOCK, VEHICLE, fixes, free_port, serve, wait_for
 from test_run import simulate
 
 from lumidock.datatypes import Frame
+from lumidock.evaluation.metrics import evaluate
+from lumidock.report import report
+from lumidock.report.moments import images_of
+from lumidock.report.view import load_run
 from lumidock.streams.sources import open_source
 
 
@@ -44,6 +49,14 @@ def test_live_gives_the_fixes_of_a_replay(sequence, tmp_path, listener):
     assert [m.usec for m in found] == [int(row["t_ns"]) // 1000 for row in valid]
     for message, row in zip(found, valid, strict=True):
         assert abs(-message.x - float(row["z_m"]) - 0.8) < 0.1
+    live, replayed = (json.loads((tmp_path / name / "run.json").read_text()) for name in ("live", "run"))
+    assert set(replayed) <= set(live)
+    for name in ("method", "cold", "source", "inputs_sha256", "config"):
+        assert live[name] == replayed[name]
+    for name in set(replayed["counts"]) - {"latency_us"}:
+        assert live["counts"][name] == replayed["counts"][name]
+    assert set(live["counts"]["latency_us"]) == {"p50", "p95", "p99", "max"}
+    assert live["counts"]["camera"]["dropped"] == 0
     recorded = [item.t_ns for item in open_source(tmp_path / "live.mcap").items()]
     assert recorded == [int(row["t_ns"]) for row in rows(tmp_path / "run")]
 
@@ -56,6 +69,25 @@ def test_sigterm_ends_it_in_good_order(sequence, tmp_path):
     assert (served.returncode, err) == (0, ""), out
     assert len(rows(tmp_path / "live")) >= 3
     assert (tmp_path / "live.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
+
+
+def test_a_recording_that_was_shown_twice_is_evaluated_and_reported(sequence, tmp_path):
+    served = serve(sequence, "--loop", "--out", tmp_path / "live")
+    wait_for(lambda: json.loads(urllib.request.urlopen(served.url + "health.json").read())["fixes"]["frames"] >= 10)
+    served.terminate()
+    served.communicate(timeout=20)
+    table = rows(tmp_path / "live")
+    assert any(row["frame"].startswith("1.") for row in table)
+    result = evaluate(tmp_path / "live", sequence)
+    assert result["frames"] == sum(row["frames"] for row in result["by_true_z"]) == len(table)
+    assert result["hazardous"]["valid"]["any"] == 0
+    assert sum(row["frames"] for row in result["by_true_z"]) == len(table)
+    view = load_run(tmp_path / "live", sequence)
+    assert np.isfinite(view.true_position).all()
+    assert view.visible.any(axis=1).all()
+    (shown,) = images_of(view, [(len(table) - 1, "last")])
+    assert shown.jpeg_base64
+    assert "With truth" in report([tmp_path / "live"], [sequence])
 
 
 def records(folder):
@@ -82,6 +114,9 @@ def check_killed(sequence, folder, seconds):
     table = rows(folder / "live")
     assert len(table) >= frames - 4  # at four frames a second
     assert all(row["status"] and None not in row for row in table)
+    described = json.loads((folder / "live" / "run.json").read_text())
+    assert (described["live"], described["counts"]["finished"]) == (True, False)
+    assert described["counts"]["frames"] >= len(table) - 5  # a second old at most
     if frames > 4:
         for kind in ("mcap", "mp4"):
             found = [item for item in open_source(folder / f"live.{kind}").items() if isinstance(item, Frame)]

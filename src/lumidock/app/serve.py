@@ -311,6 +311,12 @@ class Server:
         self.last = fix
         return fix.stage
 
+    def losses(self) -> dict[str, Any]:
+        """What a run folder of this server does not hold: for its run.json."""
+        queues = {worker.name: {"dropped": worker.dropped, "stale": worker.stale} for worker in self.workers}
+        camera = {"frames": self.camera.frames, "dropped": self.newest.dropped, "reconnects": self.camera.reconnects}
+        return {"camera": camera | {"problem": self.camera.problem}, "sinks": queues}
+
     def health(self) -> dict[str, Any]:
         """Rates, latencies, drops and reasons, for the page and for machines."""
         now, arrivals = time.monotonic(), list(self.arrivals_s)

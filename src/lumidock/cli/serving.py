@@ -9,19 +9,20 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from lumidock import methods
+from lumidock.app.run import LiveRecord, Record, Setup, identity_of
 from lumidock.app.serve import STALE_S, Newest, Server, SourceReader, Worker
 from lumidock.app.warm import warm_up
-from lumidock.camera import Camera, save_camera
+from lumidock.camera import Camera
 from lumidock.cli.shared import (
     SIM,
     AsJson,
@@ -44,6 +45,7 @@ from lumidock.cli.shared import (
     copy,
     example,
     file_of,
+    keep_camera,
     open_any,
     prepare_folder,
     require_new,
@@ -56,7 +58,8 @@ from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
-from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, open_rerun
+from lumidock.streams.run_folder import RunFolder
+from lumidock.streams.sinks import FILE_KINDS, Numbered, Setting, open_rerun
 from lumidock.streams.source import Network, Reading, Source
 from lumidock.streams.vehicle import load_vehicle
 
@@ -180,7 +183,16 @@ def _serve(
         page = _health_page(host, health_port, server)
         stack.callback(page.close)
         # last of all, so that a start that fails leaves what is on the disk alone
-        sinks += _file_sinks(setting, station_file, out, record or [], force)
+        sinks += _record_sinks(setting, record or [], force)
+        if out is not None:
+            prepare_folder(out, force)
+
+            def identity(camera_file: Path) -> dict[str, Any]:
+                made_with = Setup(method, False, settings, station_file, camera_file)
+                return identity_of(opened, made_with) | {"live": True, "loop": loop}
+
+            keeping = partial(keep_camera, calibration)
+            sinks.append(_folder_sink(out, setting, station_file, keeping, identity, server.losses))
         print(f"health at http://{host}:{page.port}/", file=sys.stderr if as_json else sys.stdout, flush=True)
         with _stopped_by_signals(server.stop):
             server.serve()
@@ -288,22 +300,27 @@ def _viewer_sinks(setting: Setting, foxglove_port: int | None, rerun: str | None
     return workers
 
 
-def _file_sinks(
-    setting: Setting, station_file: Path, out: Path | None, record: list[Path], force: bool
-) -> list[Worker]:
+def _folder_sink(
+    out: Path,
+    setting: Setting,
+    station_file: Path,
+    keep_camera_as: Callable[[Path], Path],
+    identity: Callable[[Path], dict[str, Any]],
+    losses: Callable[[], dict[str, Any]],
+) -> Worker:
+    """A run folder, locked and described. Raises: InputError where another process is writing a run there."""
+    folder = RunFolder(out, setting.station.ids)
+    copy(station_file, out / "station.yaml")
+    live = LiveRecord(Record(folder, identity(keep_camera_as(out / "camera.yaml")), losses))
+    return Worker(out.name, lambda: live, queue=_ROWS, pictures=False)
+
+
+def _record_sinks(setting: Setting, record: list[Path], force: bool) -> list[Worker]:
     for path in record:
         if path.suffix not in FILE_KINDS:
             raise InputError(f"--record {path}: not one of {', '.join(FILE_KINDS)}")
         require_new(path, force)
-    workers = []
-    if out is not None:
-        prepare_folder(out, force)
-        folder = RunSink(out, setting.station.ids)
-        copy(station_file, out / "station.yaml")
-        save_camera(setting.camera, out / "camera.yaml")
-        workers.append(Worker(out.name, lambda: folder, queue=_ROWS, pictures=False))
-    workers += [Worker(path.name, Numbered(path, setting).open, queue=_LONG, patient=True) for path in record]
-    return workers
+    return [Worker(path.name, Numbered(path, setting).open, queue=_LONG, patient=True) for path in record]
 
 
 def _host_and_port(option: str, text: str) -> tuple[str, int]:

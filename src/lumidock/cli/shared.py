@@ -47,6 +47,7 @@ _SIMULATED = (
     "lights_truth.csv",
     "spurious_truth.csv",
     "stream_truth.csv",
+    "truth.tum",
 )
 
 SCENARIOS = ", ".join(sorted(Path(entry.name).stem for entry in (files("lumidock") / "sim" / "scenarios").iterdir()))
@@ -67,11 +68,16 @@ VehicleOption = Annotated[
     Path | None, typer.Option("--vehicle", metavar="FILE", help="Vehicle file: frame names and the camera's mounting.")
 ]
 Topic = Annotated[str | None, typer.Option("--topic", metavar="NAME", help="The pictures of a bag that has several.")]
-SourceArgument = Annotated[
-    str,
+SourcesArgument = Annotated[
+    list[str],
     typer.Argument(
-        metavar="SOURCE", help="Sequence or image folder, video, bag, sim:SCENARIO[:SEED], or a camera's address."
+        metavar="SOURCE...",
+        help="Sequence or image folder, video, bag, sim:SCENARIO[:SEED], or a camera's address; several recordings.",
     ),
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option("--cluster", metavar="ADDRESS", help="Run on the dask cluster there: tcp://HOST:PORT."),
 ]
 Method = Annotated[
     str, typer.Option("--method", metavar="NAME", help="lumidock, paper, a baseline, or one of an installed package.")

@@ -18,7 +18,7 @@ from lumidock.datatypes import Array
 from lumidock.errors import InputError
 from lumidock.evaluation import claims
 from lumidock.evaluation.claims import GuideClaims, PoseClaims
-from lumidock.evaluation.run_description import description_if_any, mean_nis, source_kind
+from lumidock.evaluation.run_description import description_if_any, mean_nis, source_kind, with_passes
 from lumidock.geometry import pose_from_quat, se3_inverse, transform_points
 from lumidock.station import Station, load_station
 from lumidock.streams.run_folder import COVARIANCE_COLUMNS, GUIDE_COLUMNS, PROTECTION_COLUMNS
@@ -50,6 +50,7 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
     folder = truth if truth.is_dir() else truth.parent
     true, path = true_poses(truth), run_folder / "fixes.csv"
     fixes = read_rows(path, ("frame", "t_ns", "valid", "reason", *_POSE))
+    true = with_passes(true, (row["frame"] for row in fixes))
     description = description_if_any(run_folder)
     _require_same_frames(truth, fixes, true, stamped=source_kind(description) in _STAMPED)
     poses = {row["frame"]: _pose(path, row) for row in fixes if row["valid"] == "1"}
@@ -86,6 +87,7 @@ def _require_same_frames(truth: Path, fixes: list[Row], true: dict[str, Array], 
         raise InputError(f"{truth}: knows none of the run's frames")
     path = truth / "truth.csv" if truth.is_dir() else truth
     true_stamp = {row["frame"]: row.get("t_ns", "") for row in read_rows(path, ("frame",))}
+    true_stamp = with_passes(true_stamp, (row["frame"] for row in known))
     pairs = [(row["t_ns"], true_stamp[row["frame"]]) for row in known]
     t_ns = np.array([pair for pair in pairs if all(map(_STAMP.fullmatch, pair))], np.int64).reshape(-1, 2)
     steps = np.diff(t_ns, axis=0)
@@ -300,6 +302,7 @@ def _identities(run_folder: Path, truth_folder: Path, true: dict[str, Array]) ->
     than 3 px away, as where a reflection or a lit edge beside the lamp was detected.
     """
     lights, path, pixel = _true_lights(truth_folder / "lights_truth.csv"), run_folder / "lights.csv", ("u_px", "v_px")
+    lights = with_passes(lights, true)
     counts = {"identified": 0, "wrong": 0, "displaced": 0}
     for row in read_rows(path, ("frame", "light", *pixel)):
         if not row["light"] or row["frame"] not in true:

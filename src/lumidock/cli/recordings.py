@@ -1,0 +1,191 @@
+"""Running recordings: one in this process, or many over workers, each into a run folder of its own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from lumidock.cli.shared import (
+    Calibration,
+    calibration_of,
+    copy,
+    file_of,
+    keep_camera,
+    open_any,
+    prepare_folder,
+)
+from lumidock.config import Config, load_config
+from lumidock.datatypes import Fix
+from lumidock.errors import InputError, LumidockError
+from lumidock.methods import localizer_of
+from lumidock.station import load_station
+from lumidock.streams.source import Item, Reading, Source
+
+Report = Callable[[int, int | None], None]
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """The options of `run` beside source and target, as they were given."""
+
+    station: str | None = None
+    camera: str | None = None
+    method: str = "lumidock"
+    cold: bool = False
+    topic: str | None = None
+    info_topic: str | None = None
+    bits: int = 16
+    fps: float | None = None
+    as_stored: bool = False
+    delay_ms: float = 0.0
+    camera_name: str | None = None
+    trusted: bool = False
+    config: Path | None = None
+
+    def reading(self) -> Reading:
+        """How the source is to be read."""
+        more = {"as_stored": self.as_stored, "trusted": self.trusted, "follow_calibration": self.camera is None}
+        return Reading(self.fps, self.topic, self.info_topic, self.bits, **more)
+
+    def as_read(self) -> dict[str, Any]:
+        """What of them decides about pictures and stamps, for run.json."""
+        names = ("topic", "info_topic", "bits", "fps", "as_stored", "delay_ms", "camera_name", "trusted")
+        return {name: value for name, value in asdict(self).items() if name in names}
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """An opened source with the files that belong to it."""
+
+    source: Source
+    station_file: Path
+    calibration: Calibration
+    config: Config
+    options: RunOptions
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a person should know of it."""
+        return (*self.source.notes, *self.calibration.warnings)
+
+
+def open_recording(source: str, options: RunOptions) -> Recording:
+    """Open a source with its station and camera. Raises: InputError, one line."""
+    opened = open_any(source, options.reading(), delay_ms=options.delay_ms, station=options.station)
+    station_file = file_of("station", options.station, opened.station, opened)
+    calibration = calibration_of(options.camera, opened, name=options.camera_name, trusted=options.trusted)
+    config = load_config(options.config) if options.config else Config()
+    return Recording(opened, station_file, calibration, config, options)
+
+
+def run_recording(
+    recording: Recording,
+    out: Path,
+    *,
+    progress: Report = lambda _done, _total: None,
+    let_interrupt: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:
+    """Localize all frames of a recording into the folder `out`, which is there; returns the counts.
+
+    Raises: InputError when no row could be used, or where another process is writing there.
+    """
+    from lumidock.app.run import Setup, run
+    from lumidock.streams.run_folder import RunFolder
+
+    options, lens = recording.options, recording.calibration.camera
+    dock, done = load_station(recording.station_file), 0
+    localizer = localizer_of(options.method, dock, lens, recording.config, cold=options.cold)
+    with RunFolder(out, dock.ids) as folder:
+        copy(recording.station_file, out / "station.yaml")
+        camera_file = keep_camera(recording.calibration, out / "camera.yaml")
+        setup = Setup(
+            options.method, options.cold, recording.config, recording.station_file, camera_file, options.as_read()
+        )
+
+        def on_fix(_item: Item, _fix: Fix) -> None:
+            nonlocal done
+            done += 1
+            progress(done, recording.source.count)
+            let_interrupt()
+
+        size = lens.width, lens.height
+        return run(recording.source, localizer, folder, setup, on_fix=on_fix, size=size).as_dict()
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One recording of many; with `force` a folder that holds another run is written anew."""
+
+    source: str
+    out: Path
+    options: RunOptions
+    force: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The counts of a recording, or the error that ended it; `kept` where an earlier call had finished it."""
+
+    counts: dict[str, Any] | None
+    error: str = ""
+    notes: tuple[str, ...] = ()
+    kept: bool = False
+
+
+def jobs_of(sources: list[str], out: Path, options: RunOptions, *, force: bool) -> dict[str, Job]:
+    """A job for each recording, by the name of its run folder: the file's, with a number where it comes again."""
+    jobs = dict[str, Job]()
+    for source in sources:
+        stem = Path(source).resolve().name.split(".")[0] or "recording"
+        name, number = stem, 1
+        while name in jobs:
+            number += 1
+            name = f"{stem}-{number}"
+        jobs[name] = Job(source, out / name, options, force)
+    return jobs
+
+
+def run_job(job: Job) -> Outcome:
+    """Run a recording, unless it was finished before; an error is told, and ends none of the others."""
+    cv2.setNumThreads(1)
+    notes: tuple[str, ...] = ()
+    try:
+        recording = open_recording(job.source, job.options)
+        notes = recording.notes
+        counts = _finished(recording, job)
+        if counts is not None:
+            return Outcome(counts, notes=notes, kept=True)
+        prepare_folder(job.out, force=True)
+        return Outcome(run_recording(recording, job.out), notes=notes)
+    except (LumidockError, OSError) as error:
+        return Outcome(None, " ".join(str(error).split()), notes)
+
+
+def _finished(recording: Recording, job: Job) -> dict[str, Any] | None:
+    """The counts of an earlier call that finished the same run; None where it has to be done, or done again.
+
+    Raises: InputError for a folder that holds anything else, unless `force`.
+    """
+    from lumidock.app.run import Setup, identity_of
+
+    if not job.out.exists() or not any(job.out.iterdir()):
+        return None
+    options, wanted = job.options, recording.calibration.file or job.out / "camera.yaml"
+    try:
+        described = json.loads((job.out / "run.json").read_text(encoding="utf-8"))
+        setup = Setup(options.method, options.cold, recording.config, recording.station_file, wanted, options.as_read())
+        identity = json.loads(json.dumps(identity_of(recording.source, setup)))
+        same = all(described.get(name) == value for name, value in identity.items())
+        counts = dict(described["counts"])
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        same, counts = False, {}
+    if same and counts.get("finished") and counts.get("usable"):
+        return counts
+    if not same and not job.force:
+        raise InputError(f"{job.out}: holds something else than this run; give --force to replace it")
+    return None
