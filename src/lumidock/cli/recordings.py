@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -175,11 +176,14 @@ def _finished(recording: Recording, job: Job) -> dict[str, Any] | None:
 
     if not job.out.exists() or not any(job.out.iterdir()):
         return None
-    options, wanted = job.options, recording.calibration.file or job.out / "camera.yaml"
+    options = job.options
     try:
         described = json.loads((job.out / "run.json").read_text(encoding="utf-8"))
-        setup = Setup(options.method, options.cold, recording.config, recording.station_file, wanted, options.as_read())
-        identity = json.loads(json.dumps(identity_of(recording.source, setup)))
+        with TemporaryDirectory() as folder:
+            camera_file = keep_camera(recording.calibration, Path(folder) / "camera.yaml")
+            files = recording.config, recording.station_file, camera_file
+            setup = Setup(options.method, options.cold, *files, options.as_read())
+            identity = json.loads(json.dumps(identity_of(recording.source, setup)))
         same = all(described.get(name) == value for name, value in identity.items())
         counts = dict(described["counts"])
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
