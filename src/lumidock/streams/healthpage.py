@@ -11,6 +11,8 @@ from functools import partial
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Any
 
+from lumidock.streams.localweb import is_answered
+
 _TIMEOUT_S = 2.0  # a client may take over one request
 _STYLE = "body{font:15px/1.5 monospace;margin:2em;max-width:60em}td{padding:0 1.5em 0 0;vertical-align:top}"
 
@@ -55,6 +57,10 @@ class _Handler(BaseHTTPRequestHandler):
             limit.cancel()
 
     def do_GET(self) -> None:  # the name that http.server calls
+        listening = str(self.server.server_address[0])
+        if not is_answered(listening, self.headers.get("Host"), self.headers.get("Origin")):
+            self.send_error(403)
+            return
         health = self._health()
         if self.path == "/health.json":
             self._answer("application/json", json.dumps(health))
