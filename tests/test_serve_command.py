@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commandline import LUMIDOCK, VEHICLE, fixes, free_port, serve, wait_for
+import zenoh
+from commandline import LUMIDOCK, NO_DISTORTION, VEHICLE, fixes, free_port, serve, wait_for
 from test_run import simulate
 
 from lumidock.datatypes import Frame
@@ -196,6 +197,72 @@ def test_everything_listens_on_this_machine_only(sequence):
     finally:
         served.terminate()
         served.communicate(timeout=20)
+
+
+def test_a_zenoh_session_without_a_router_is_said_and_its_coming_noticed(sequence):
+    port = free_port()
+    served = serve(sequence, "--loop", "--zenoh", f"tcp/127.0.0.1:{port}")
+
+    def problem():
+        health = json.loads(urllib.request.urlopen(served.url + "health.json").read())
+        return health["sinks"]["zenoh"]["problem"]
+
+    wait_for(lambda: "no zenoh router or peer answers" in problem())
+    config = zenoh.Config()
+    for key, value in {"mode": "router", "listen/endpoints": [f"tcp/127.0.0.1:{port}"]}.items():
+        config.insert_json5(key, json.dumps(value))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config):
+        wait_for(lambda: not problem())
+    served.terminate()
+    _, err = served.communicate(timeout=20)
+    assert "lumidock: warning: zenoh: no zenoh router or peer answers at tcp/127.0.0.1" in err
+
+
+def attack(sequence, folder, first, page):
+    """A second server after the folder and the ports of the first: refused in one line, with nothing touched."""
+    port = page.rstrip("/").rpartition(":")[2]
+    for more in (("--health-port", port), ("--health-port", "0", "--force"), ("--health-port", port, "--force")):
+        words = ["serve", str(sequence), "--out", str(folder / "live"), *more]
+        before = first.poll()
+        done = subprocess.run([LUMIDOCK, *words], capture_output=True, text=True, timeout=60)
+        assert before is None
+        assert (done.returncode, done.stdout) == (2, ""), done.stderr
+        assert len([line for line in done.stderr.splitlines() if not line.startswith(NO_DISTORTION)]) == 1, done.stderr
+
+
+def check_attacked(sequence, folder, seconds):
+    """Kill a server that another one attacks; every row that its health had told of is there, and nobody else's."""
+    served = serve(sequence, "--loop", "--out", folder / "live")
+    attack(sequence, folder, served, served.url)
+    time.sleep(seconds)
+    frames = json.loads(urllib.request.urlopen(served.url + "health.json").read())["fixes"]["frames"]
+    served.kill()
+    served.communicate()
+    table = rows(folder / "live")
+    assert len(table) >= frames - 4
+    names = [row["frame"] for row in table]
+    assert len(set(names)) == len(names)
+    assert all(row["status"] and None not in row for row in table)
+    again = serve(sequence, "--out", folder / "live", "--force")
+    _, err = again.communicate(timeout=60)
+    assert (again.returncode, "Traceback" in err) == (0, False)
+    assert [row["frame"] for row in rows(folder / "live")] == [f"{k:06d}" for k in range(7)]
+
+
+def test_a_second_server_touches_nothing_of_the_first(sequence, tmp_path):
+    check_attacked(sequence, tmp_path, 0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(5))
+def test_two_hundred_starts_and_kills_under_attack(sequence, tmp_path, rng, part):
+    for number in range(40):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        seconds = float(rng.uniform(0.0, 2.0))
+        print(f"part {part}, kill {number}: after {seconds:.3f} s")  # noqa: T201  # in the report of a failure
+        check_attacked(sequence, folder, seconds)
 
 
 def test_garbage_and_floods_on_every_port_are_borne(sequence, rng, listener):

@@ -197,6 +197,7 @@ class Worker(threading.Thread):
         while not self._over():
             try:
                 sink = self._open()
+                self.problem = getattr(sink, "problem", self.problem)
                 self.tried.set()
                 try:
                     self._feed(sink)
@@ -231,6 +232,7 @@ class Worker(threading.Thread):
                 if done is None and self._halt:
                     return
             tick()
+            self.problem = getattr(sink, "problem", self.problem)
             if done is not None:
                 if (
                     self._patient
@@ -247,7 +249,7 @@ class Worker(threading.Thread):
         self._tell_skipped(sink)
         sink.add(done.taken.item, done.fix, done.latency_us)
         self.sent += 1
-        self.problem = ""
+        self.problem = getattr(sink, "problem", "")
         self.delay_s.append(time.monotonic() - done.taken.at_s)
 
     def _tell_skipped(self, sink: Sink) -> None:
@@ -273,8 +275,11 @@ class Server:
     last: Fix | None = None
     started_s: float = field(default_factory=time.monotonic)
 
-    def serve(self) -> None:
-        """Localize the newest frame, over and over, until told to stop or the recording ends."""
+    def serve(self, ready: Callable[[], None] = lambda: None) -> None:
+        """Localize the newest frame, over and over, until told to stop or the recording ends.
+
+        `ready` is called when every sink has been opened, well or not.
+        """
         stage: Stage = "search"
         gc.collect()
         gc.freeze()  # objects alive now stay alive, and scanning them would lengthen every pause of the collector
@@ -283,6 +288,7 @@ class Server:
         ready_s = time.monotonic() + _OPENING_S
         for worker in self.workers:  # a sink that is slow to open would lag from the first frame on
             worker.tried.wait(max(0.0, ready_s - time.monotonic()))
+        ready()
         self.camera.start()
         try:
             while not self.stop.is_set():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import signal
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -93,6 +94,7 @@ _COMMANDS = (
 def main() -> None:
     """Entry point: every error that the user can correct is one line and exit code 2."""
     _keep_streams_clean()
+    _clean_up_at_sigterm()
     try:
         code = app(standalone_mode=False, prog_name="lumidock")
         print(end="", flush=True)
@@ -109,6 +111,12 @@ def main() -> None:
         _drop_output()
         _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
     sys.exit(code or 0)
+
+
+def _clean_up_at_sigterm() -> None:
+    """Let SIGTERM end the program in good order: no worker and no temporary folder is left behind."""
+    if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
 
 
 def _keep_streams_clean() -> None:

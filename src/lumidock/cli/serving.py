@@ -195,7 +195,7 @@ def _serve(
             sinks.append(_folder_sink(out, setting, station_file, keeping, identity, server.losses))
         print(f"health at http://{host}:{page.port}/", file=sys.stderr if as_json else sys.stdout, flush=True)
         with _stopped_by_signals(server.stop):
-            server.serve()
+            server.serve(lambda: tell(f"{sink.name}: {sink.problem}" for sink in server.workers if sink.problem))
     _print_counts(server, as_json)
     if server.camera.problem and not opened.live:
         raise InputError(server.camera.problem)

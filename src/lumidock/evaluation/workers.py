@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from typing import Any, TypeVar
 
 from lumidock.errors import InputError, LumidockError
+from lumidock.sim.children import end_children, start_child
 
 _MAX_POOLS = 4  # a worker that dies breaks its pool; after so many broken pools the work is given up
 _Job = TypeVar("_Job")
@@ -75,6 +74,9 @@ def worker_pool(workers: int, cluster: str | None) -> Iterator[Executor]:
     with ProcessPoolExecutor(workers, mp_context=spawn, initializer=_start_worker) as pool:
         try:
             yield pool
+        except SystemExit:  # SIGTERM: what is not finished is begun again by the next call
+            end_children()
+            raise
         finally:
             pool.shutdown(cancel_futures=True)
 
@@ -93,11 +95,4 @@ def _dask_client(address: str) -> Any:  # noqa: ANN401
 def _start_worker() -> None:
     """Let a worker end silently at Ctrl-C, and when its parent process ends."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    start_child()

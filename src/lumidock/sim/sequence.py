@@ -22,6 +22,7 @@ from lumidock.camera import Camera, save_camera
 from lumidock.datatypes import Array, Indices, in_seconds
 from lumidock.errors import InputError, LumidockError
 from lumidock.geometry import quat_xyzw_from_rotation
+from lumidock.sim.children import end_children, start_child
 from lumidock.sim.detections import SimulatedFrame, simulated_frames
 from lumidock.sim.draws import Draw
 from lumidock.sim.frames import ExpectedFrame, FrameConditions, FrameRenderer
@@ -166,9 +167,12 @@ def _mapping(workers: int) -> Iterator[Callable[..., Iterable[Any]]]:
         yield map
         return
     spawn = get_context("spawn")  # a fork would inherit the locks of OpenCV's threads
-    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=cv2.setNumThreads, initargs=(1,)) as pool:
+    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=start_child) as pool:
         try:
             yield partial(_mapped, pool)
+        except SystemExit:  # SIGTERM: nobody waits for pictures that are begun
+            end_children()
+            raise
         finally:
             pool.shutdown(cancel_futures=True)
 

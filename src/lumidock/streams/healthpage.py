@@ -22,7 +22,7 @@ class HealthPage:
 
     def __init__(self, host: str, port: int, health: Callable[[], dict[str, Any]]) -> None:
         """Listen on `host`, `port` (0: any that is free). Raises: OSError when that cannot be."""
-        self._server = _Server((host, port), partial(_Handler, health))
+        self._server = _Server((host, port), partial(_Handler, health, host))
         self._thread = threading.Thread(target=self._server.serve_forever, name="health", daemon=True)
         self._thread.start()
 
@@ -45,8 +45,8 @@ class _Server(HTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "lumidock", ""
 
-    def __init__(self, health: Callable[[], dict[str, Any]], *connection: Any) -> None:  # noqa: ANN401
-        self._health = health
+    def __init__(self, health: Callable[[], dict[str, Any]], host: str, *connection: Any) -> None:  # noqa: ANN401
+        self._health, self._listening = health, host
         # over all of it: one byte a second would keep the next client waiting
         limit = threading.Timer(_TIMEOUT_S, lambda: connection[0].shutdown(socket.SHUT_RDWR))
         limit.daemon = True
@@ -57,8 +57,7 @@ class _Handler(BaseHTTPRequestHandler):
             limit.cancel()
 
     def do_GET(self) -> None:  # the name that http.server calls
-        listening = str(self.server.server_address[0])
-        if not is_answered(listening, self.headers.get("Host"), self.headers.get("Origin")):
+        if not is_answered(self._listening, self.headers.get("Host"), self.headers.get("Origin")):
             self.send_error(403)
             return
         health = self._health()

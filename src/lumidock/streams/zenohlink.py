@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 import zenoh
@@ -13,7 +14,7 @@ from lumidock.streams import ros2, rostypes
 from lumidock.streams.vehicle import Vehicle
 from lumidock.streams.zenohsession import is_connected, nobody_at, open_session, wait_for_router
 
-_NODE = "lumidock"
+_NODE, _LOOK_S = "lumidock", 0.5
 _QOS = "::,10:,:,:,,"  # the defaults of ROS 2: reliable, volatile, the last ten
 
 
@@ -43,11 +44,15 @@ class ZenohLink:
             token = f"@ros2_lv/{domain}/{self._id}/0/{number}/MP/%/%/{_NODE}/{place}/{typed}/{_QOS}"
             self._tokens.append(liveliness.declare_token(token))
         wait_for_router(self._session)
+        self.problem, self._looked_s = "", -math.inf  # why nobody receives what is published
+        self.tick()
 
-    @property
-    def problem(self) -> str:
-        """Why nobody receives what is published, where that is known."""
-        return "" if is_connected(self._session) else f"{nobody_at(self._endpoint)}; messages are dropped"
+    def tick(self) -> None:
+        """Look now and then whether there is a router."""
+        if time.monotonic() - self._looked_s >= _LOOK_S:
+            self._looked_s = time.monotonic()
+            connected = is_connected(self._session)
+            self.problem = "" if connected else f"{nobody_at(self._endpoint)}; messages are dropped"
 
     def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
         """Publish one frame."""
