@@ -2,8 +2,10 @@
 
 import hashlib
 import math
+import re
 import socket
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -281,3 +283,17 @@ def test_nobody_listening_is_no_error():
         link.add(Frame("a", 5, IMAGE), Fix("a", 5, "tracking", "rear", T_dock_cam=np.diag([1.0, -1, -1, 1])), 7)
         time.sleep(0.01)
     link.close()
+
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+@pytest.mark.parametrize("name", ["ardusub.param", "rover.param"])
+def test_parameter_files_hold_the_parameters_that_the_page_explains(name):
+    lines = [line for line in (DOCS / name).read_text().splitlines() if not line.startswith("#")]
+    parameters = dict(line.split(",") for line in lines)
+    assert len(parameters) == len(lines)
+    assert all(math.isfinite(float(value)) for value in parameters.values())
+    explained = set(re.findall(r"`([A-Z0-9]+_[A-Z0-9_]+)`", (DOCS / "ardupilot.md").read_text()))
+    assert set(parameters) <= explained
+    assert 0 <= float(parameters["VISO_DELAY_MS"]) <= 250  # ArduPilot's limits

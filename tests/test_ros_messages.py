@@ -1,6 +1,7 @@
 """A fix as ROS 2 messages: frames with one parent, covariances that are known, poses as filters and nav2 take them."""
 
 from itertools import count
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -143,3 +144,11 @@ def test_diagnostics_come_once_a_second_and_tell_what_is_wrong():
         told = published(fix, publication=publication).get("/diagnostics", [])
         levels += [(message.status[0].level, message.status[0].message) for message in told]
     assert levels == [(1, "no lights"), (0, "pose"), (2, "bad frame")]
+
+
+def test_the_page_lists_every_topic():
+    page = (Path(__file__).parents[1] / "docs" / "ros.md").read_text()
+    for topic, kind in TYPES.items():
+        assert f"`{topic}`" in page
+        line = next(line for line in page.splitlines() if f"`{topic}`" in line)
+        assert kind.rpartition("/")[2] in line or "displays" in line
