@@ -62,7 +62,8 @@ class Publication:
         if fix.T_dock_cam is not None:
             yield from self._pose(fix, fix.T_dock_cam, t_ns)
         if picture and isinstance(item, Frame):
-            yield serialized(f"{PREFIX}/camera_info", t_ns, rospicture.camera_info(self._camera, t_ns, self._cam))
+            if self._camera.port is None:  # CameraInfo has no words for a port
+                yield serialized(f"{PREFIX}/camera_info", t_ns, rospicture.camera_info(self._camera, t_ns, self._cam))
             yield serialized(f"{PREFIX}/image/compressed", t_ns, rospicture.compressed(item, t_ns, self._cam))
             yield serialized(f"{PREFIX}/annotations", t_ns, rospicture.rings(fix, t_ns, self._light_ids))
 

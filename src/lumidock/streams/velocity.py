@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -27,10 +26,10 @@ def body_velocity(fix: Fix, vehicle: Vehicle) -> BodyVelocity | None:
     The `velocity` of a fix is that of cam in dock, in axes of cam: `linear_m_s` (3,), `angular_rad_s` (3,) and the
     `covariance` (6, 6) of both. The body's origin moves by the turn rate times its distance from the camera besides.
     """
-    found: Any = getattr(fix, "velocity", None)
-    if found is None:
+    if fix.velocity is None:
         return None
-    motion_cam, covariance = np.concatenate([found.linear_m_s, found.angular_rad_s]), found.covariance
+    covariance = fix.velocity.covariance
+    motion_cam = np.concatenate([fix.velocity.linear_m_s, fix.velocity.angular_rad_s])
     if not (np.isfinite(motion_cam).all() and np.isfinite(covariance).all()):
         return None
     R_body_cam, lever_cam = vehicle.T_body_cam[:3, :3], se3_inverse(vehicle.T_body_cam)[:3, 3]
