@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import common
 from scipy.spatial.transform import Rotation
 
 from lumidock.app.serve import Done, Taken, Worker
-from lumidock.datatypes import Fix, Frame, Guide
+from lumidock.datatypes import Fix, Frame, Guide, Velocity
 from lumidock.errors import InputError
 from lumidock.geometry import bearing_and_range, se3_exp, se3_inverse
 from lumidock.streams.mavlink import Identity, Mavlink, ResetCounter, signing_key
@@ -174,13 +174,11 @@ def test_the_landing_target_is_the_docks_origin_seen_from_the_body(T_dock_cam, T
 
 
 def moving(T_dock_cam, velocity):
-    return SimpleNamespace(t_ns=5_000, T_dock_cam=T_dock_cam, covariance=None, velocity=velocity)
+    return Fix("a", 5_000, "tracking", "rear", T_dock_cam=T_dock_cam, velocity=velocity)
 
 
 def velocity_of(linear, angular, sigma=0.1):
-    return SimpleNamespace(
-        linear_m_s=np.asarray(linear), angular_rad_s=np.asarray(angular), covariance=np.eye(6) * sigma**2
-    )
+    return Velocity(np.asarray(linear), np.asarray(angular), np.eye(6) * sigma**2)
 
 
 @given(transforms(), transforms(1.0))

@@ -2,7 +2,6 @@
 
 from itertools import count
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 from test_run import CAMERA
 
-from lumidock.datatypes import Fix, Frame
+from lumidock.datatypes import Fix, Frame, Velocity
 from lumidock.geometry import se3_exp, se3_inverse
 from lumidock.streams.ros2 import Publication
 from lumidock.streams.rostypes import TYPES, UNKNOWN_VARIANCE, typestore
@@ -105,11 +104,8 @@ def test_what_is_not_known_has_no_zero_covariance():
 
 
 def test_a_known_velocity_is_the_twist_of_the_body():
-    velocity = SimpleNamespace(
-        linear_m_s=np.array([0.0, 0.0, 0.5]), angular_rad_s=np.array([0.0, 0.2, 0.0]), covariance=np.eye(6) * 0.01
-    )
-    fix = SimpleNamespace(**{name: getattr(fix_of(HEAD_ON), name) for name in Fix.__slots__} | {"velocity": velocity})
-    fix.valid = True
+    velocity = Velocity(np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.2, 0.0]), np.eye(6) * 0.01)
+    fix = fix_of(HEAD_ON, velocity=velocity)
     twist = published(fix, Vehicle(AHEAD))["/lumidock/odometry"][0].twist
     # the camera turns right about its y, which is down, so the body turns by -0.2 rad/s about up; its origin, 0.8 m
     # behind the camera, swings left

@@ -81,7 +81,7 @@ class SourceReader(threading.Thread):
         self, open_items: Callable[[], Iterator[Item]], newest: Newest, *, live: bool, loop: bool, stop: threading.Event
     ) -> None:
         super().__init__(name="camera", daemon=True)
-        self._open, self._newest, self._live, self._loop, self._halt = open_items, newest, live, loop, stop
+        self._open, self._newest, self._live, self.loop, self._halt = open_items, newest, live, loop, stop
         self.frames, self.reconnects, self.problem, self.ended = 0, 0, "", False
         self._offset_ns = self._passes = 0
 
@@ -95,7 +95,7 @@ class SourceReader(threading.Thread):
                 self.problem = str(error)
             except Exception as error:  # of a library's reader: told, and tried again like any other
                 self.problem = f"{type(error).__name__}: {' '.join(str(error).split())}"
-            if not self._live and (not self._loop or self.problem):
+            if not self._live and (not self.loop or self.problem):
                 break
             self._passes += 1
             if self._live:
@@ -118,7 +118,7 @@ class SourceReader(threading.Thread):
             if not self._live:  # unlike a camera, a recording would decode its next image while this one is localized
                 self._newest.wait_until_idle(_LOOK_S)
                 self._halt.wait(_YIELD_S)
-        if self._loop and first_ns is not None:
+        if self.loop and first_ns is not None:
             self._offset_ns += last_ns - first_ns + _LOOP_PAUSE_NS
             self._halt.wait(_LOOP_PAUSE_NS * 1e-9)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 
+from lumidock.app.run import Setup, identity_of, run
 from lumidock.cli.shared import (
     Calibration,
     calibration_of,
@@ -25,7 +26,8 @@ from lumidock.datatypes import Fix
 from lumidock.errors import InputError, LumidockError
 from lumidock.methods import localizer_of
 from lumidock.station import load_station
-from lumidock.streams.source import Item, Reading, Source
+from lumidock.streams.run_folder import RunFolder
+from lumidock.streams.source import Item, Network, Reading, Source
 
 Report = Callable[[int, int | None], None]
 
@@ -74,10 +76,16 @@ class Recording:
         """What a person should know of it."""
         return (*self.source.notes, *self.calibration.warnings)
 
+    def setup(self, camera_file: Path) -> Setup:
+        """What identifies a run of it beside its source, `camera_file` with the calibration as it is kept."""
+        options, files = self.options, (self.config, self.station_file, camera_file)
+        return Setup(options.method, options.cold, *files, options.as_read())
 
-def open_recording(source: str, options: RunOptions) -> Recording:
+
+def open_recording(source: str, options: RunOptions, network: Network | None = None) -> Recording:
     """Open a source with its station and camera. Raises: InputError, one line."""
-    opened = open_any(source, options.reading(), delay_ms=options.delay_ms, station=options.station)
+    reading, delay_ms, station = options.reading(), options.delay_ms, options.station
+    opened = open_any(source, reading, delay_ms=delay_ms, station=station, network=network)
     station_file = file_of("station", options.station, opened.station, opened)
     calibration = calibration_of(options.camera, opened, name=options.camera_name, trusted=options.trusted)
     config = load_config(options.config) if options.config else Config()
@@ -95,18 +103,13 @@ def run_recording(
 
     Raises: InputError when no row could be used, or where another process is writing there.
     """
-    from lumidock.app.run import Setup, run
-    from lumidock.streams.run_folder import RunFolder
-
     options, lens = recording.options, recording.calibration.camera
     dock, done = load_station(recording.station_file), 0
     localizer = localizer_of(options.method, dock, lens, recording.config, cold=options.cold)
     with RunFolder(out, dock.ids) as folder:
         copy(recording.station_file, out / "station.yaml")
         camera_file = keep_camera(recording.calibration, out / "camera.yaml")
-        setup = Setup(
-            options.method, options.cold, recording.config, recording.station_file, camera_file, options.as_read()
-        )
+        setup = recording.setup(camera_file)
 
         def on_fix(_item: Item, _fix: Fix) -> None:
             nonlocal done
@@ -172,18 +175,13 @@ def _finished(recording: Recording, job: Job) -> dict[str, Any] | None:
 
     Raises: InputError for a folder that holds anything else, unless `force`.
     """
-    from lumidock.app.run import Setup, identity_of
-
     if not job.out.exists() or not any(job.out.iterdir()):
         return None
-    options = job.options
     try:
         described = json.loads((job.out / "run.json").read_text(encoding="utf-8"))
         with TemporaryDirectory() as folder:
             camera_file = keep_camera(recording.calibration, Path(folder) / "camera.yaml")
-            files = recording.config, recording.station_file, camera_file
-            setup = Setup(options.method, options.cold, *files, options.as_read())
-            identity = json.loads(json.dumps(identity_of(recording.source, setup)))
+            identity = json.loads(json.dumps(identity_of(recording.source, recording.setup(camera_file))))
         same = all(described.get(name) == value for name, value in identity.items())
         counts = dict(described["counts"])
     except (OSError, ValueError, TypeError, KeyError, AttributeError):

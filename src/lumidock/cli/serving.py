@@ -9,20 +9,19 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from lumidock import methods
-from lumidock.app.run import LiveRecord, Record, Setup, identity_of
+from lumidock.app.run import LiveRecord, Record, identity_of
 from lumidock.app.serve import STALE_S, Newest, Server, SourceReader, Worker
 from lumidock.app.warm import warm_up
-from lumidock.camera import Camera
+from lumidock.cli.recordings import Recording, RunOptions, open_recording
 from lumidock.cli.shared import (
     SIM,
     AsJson,
@@ -41,19 +40,15 @@ from lumidock.cli.shared import (
     Trusted,
     VehicleOption,
     app,
-    calibration_of,
     copy,
     example,
-    file_of,
     keep_camera,
-    open_any,
     prepare_folder,
     require_new,
     simulated,
     tell,
     warn_if_nothing_is_kept,
 )
-from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
@@ -61,7 +56,7 @@ from lumidock.streams.healthpage import HealthPage
 from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.sensors import AidingFeed
 from lumidock.streams.sinks import FILE_KINDS, Numbered, Setting, open_rerun
-from lumidock.streams.source import Network, Reading, Source
+from lumidock.streams.source import Network
 from lumidock.streams.vehicle import load_vehicle
 
 _LOOPBACK, _ENDPOINT = "127.0.0.1", re.compile(r"(tcp|udp|tls|quic)/[^/?#]+:[0-9]{1,5}")
@@ -161,71 +156,63 @@ def _serve(
 ) -> None:
     """Localize live and send every fix to the vehicle, until stopped."""
     require_method(method)
-    settings = load_config(config) if config else Config()
     mounting = load_vehicle(vehicle) if vehicle else None
+    read_as = (topic, info_topic, bits, fps, as_stored, delay_ms, camera_name)
+    options = RunOptions(station, camera, method, False, *read_as, trusted=trust_calibration, config=config)
+    network = Network(domain, host != _LOOPBACK)
     with ExitStack() as stack:
         if source.startswith(SIM):
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             source = str(simulated(source, folder / "sequence", station, camera))
-        reading = Reading(fps, topic, info_topic, bits, as_stored=as_stored, trusted=trust_calibration)
-        reading = replace(reading, follow_calibration=camera is None)
-        network = Network(domain, host != _LOOPBACK)
-        opened = open_any(source, reading, delay_ms=delay_ms, station=station, network=network)
-        station_file = file_of("station", station, opened.station, opened)
-        calibration = calibration_of(camera, opened, name=camera_name, trusted=trust_calibration)
-        tell((*opened.notes, *calibration.warnings))
-        setting = Setting(load_station(station_file), calibration.camera, mounting)
+        recording = open_recording(source, options, network)
+        tell(recording.notes)
+        setting = Setting(load_station(recording.station_file), recording.calibration.camera, mounting)
         sinks = [
             *_mavlink_sinks(setting, mavlink, mavlink_id, mavlink_key, mavlink_heading),
-            *_ros_sinks(setting, zenoh, domain if dds else None, domain, host),
+            *_ros_sinks(setting, zenoh, network if dds else None, domain),
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
         ]
-        server = _server(opened, _ready_localizer(method, setting, settings), setting.camera, sinks, loop=loop)
-        page = _health_page(host, health_port, server)
-        stack.callback(page.close)
+        server = _server(recording, _ready_localizer(setting, recording), sinks, loop=loop)
+        page = stack.enter_context(closing(_health_page(host, health_port, server)))
         # last of all, so that a start that fails leaves what is on the disk alone
-        sinks += _record_sinks(setting, record or [], force)
-        if out is not None:
-            prepare_folder(out, force)
-
-            def identity(camera_file: Path) -> dict[str, Any]:
-                made_with = Setup(method, False, settings, station_file, camera_file)
-                return identity_of(opened, made_with) | {"live": True, "loop": loop}
-
-            keeping = partial(keep_camera, calibration)
-            sinks.append(_folder_sink(out, setting, station_file, keeping, identity, server.losses))
+        sinks += [*_record_sinks(setting, record or [], force), *_folder_sinks(out, recording, setting, server, force)]
         print(f"health at http://{host}:{page.port}/", file=sys.stderr if as_json else sys.stdout, flush=True)
-        with _stopped_by_signals(server.stop):
-            server.serve(lambda: tell(f"{sink.name}: {sink.problem}" for sink in server.workers if sink.problem))
-    _print_counts(server, as_json)
-    if server.camera.problem and not opened.live:
-        raise InputError(server.camera.problem)
+        _serve_until_stopped(server)
+    _print_end(server, as_json, live=recording.source.live)
 
 
-def _ready_localizer(name: str, setting: Setting, settings: Config) -> methods.Method:
+def _ready_localizer(setting: Setting, recording: Recording) -> methods.Method:
     """A localizer whose kernels are compiled."""
     warn_if_nothing_is_kept()
-    dock, lens = setting.station, setting.camera
-    list(warm_up(localizer_of(name, dock, lens, settings).process, dock, lens))
-    return localizer_of(name, dock, lens, settings)
+    dock, lens, name = setting.station, setting.camera, recording.options.method
+    list(warm_up(localizer_of(name, dock, lens, recording.config).process, dock, lens))
+    return localizer_of(name, dock, lens, recording.config)
 
 
-def _server(opened: Source, localizer: methods.Method, lens: Camera, sinks: list[Worker], *, loop: bool) -> Server:
+def _server(recording: Recording, localizer: methods.Method, sinks: list[Worker], *, loop: bool) -> Server:
     """A server of the newest frame of a source, which nothing has started yet."""
     sys.setswitchinterval(_SWITCH_S)
-    stop, newest = threading.Event(), Newest()
+    stop, newest, opened, lens = threading.Event(), Newest(), recording.source, recording.calibration.camera
     read = partial(opened.items, (lens.width, lens.height))
     reader = SourceReader(read, newest, live=opened.live, loop=loop, stop=stop)
     return Server(localizer, reader, newest, sinks, stop, feed=AidingFeed(opened.sensors()))
 
 
-def _print_counts(server: Server, as_json: bool) -> None:
-    """The counts of all that was served, for people or as JSON."""
+def _serve_until_stopped(server: Server) -> None:
+    """Serve, and say which sinks have nobody to send to."""
+    with _stopped_by_signals(server.stop):
+        server.serve(lambda: tell(f"{sink.name}: {sink.problem}" for sink in server.workers if sink.problem))
+
+
+def _print_end(server: Server, as_json: bool, *, live: bool) -> None:
+    """The counts of all that was served, for people or as JSON. Raises: InputError for a recording that broke off."""
     counts, dropped = server.counts, server.newest.dropped
     if as_json:
         print(json.dumps({word: counts[word] for word in ("frames", "valid", "guide")} | {"dropped": dropped}))
     else:
         print(f"{counts['frames']} frames: {counts['valid']} valid; {dropped} came too fast and were dropped")
+    if server.camera.problem and not live:
+        raise InputError(server.camera.problem)
 
 
 def _health_page(host: str, port: int, server: Server) -> HealthPage:
@@ -271,7 +258,7 @@ def _mavlink_sinks(
     return [Worker("mavlink", link, queue=1, stale_s=STALE_S, pictures=False)]
 
 
-def _ros_sinks(setting: Setting, zenoh: str | None, dds: int | None, domain: int, host: str) -> list[Worker]:
+def _ros_sinks(setting: Setting, zenoh: str | None, dds: Network | None, domain: int) -> list[Worker]:
     workers, shared = [], (setting.camera, setting.vehicle, setting.station.ids)
     if zenoh is not None:
         if not _ENDPOINT.fullmatch(zenoh):
@@ -282,7 +269,7 @@ def _ros_sinks(setting: Setting, zenoh: str | None, dds: int | None, domain: int
     if dds is not None:
         with extra("dds"), extra("bag"):
             from lumidock.streams.ddslink import DdsLink
-        workers.append(Worker("dds", partial(DdsLink, dds, host != _LOOPBACK, *shared), queue=_SHORT))
+        workers.append(Worker("dds", partial(DdsLink, dds.domain, dds.everywhere, *shared), queue=_SHORT))
     return workers
 
 
@@ -301,19 +288,19 @@ def _viewer_sinks(setting: Setting, foxglove_port: int | None, rerun: str | None
     return workers
 
 
-def _folder_sink(
-    out: Path,
-    setting: Setting,
-    station_file: Path,
-    keep_camera_as: Callable[[Path], Path],
-    identity: Callable[[Path], dict[str, Any]],
-    losses: Callable[[], dict[str, Any]],
-) -> Worker:
+def _folder_sinks(
+    out: Path | None, recording: Recording, setting: Setting, server: Server, force: bool
+) -> list[Worker]:
     """A run folder, locked and described. Raises: InputError where another process is writing a run there."""
+    if out is None:
+        return []
+    prepare_folder(out, force)
     folder = RunFolder(out, setting.station.ids)
-    copy(station_file, out / "station.yaml")
-    live = LiveRecord(Record(folder, identity(keep_camera_as(out / "camera.yaml")), losses))
-    return Worker(out.name, lambda: live, queue=_ROWS, pictures=False)
+    copy(recording.station_file, out / "station.yaml")
+    camera_file = keep_camera(recording.calibration, out / "camera.yaml")
+    identity = identity_of(recording.source, recording.setup(camera_file)) | {"live": True, "loop": server.camera.loop}
+    live = LiveRecord(Record(folder, identity, server.losses))
+    return [Worker(out.name, lambda: live, queue=_ROWS, pictures=False)]
 
 
 def _record_sinks(setting: Setting, record: list[Path], force: bool) -> list[Worker]:

@@ -21,7 +21,8 @@ from lumidock.streams.vehicle import Vehicle
 from lumidock.streams.velocity import BodyVelocity, body_velocity
 
 R_LOCAL_DOCK = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-_R_BODY_AERO = np.diag([1.0, -1.0, -1.0])  # of the body: REP-103 to aerospace axes
+_R_AERO_BODY = np.diag([1.0, -1.0, -1.0])  # of the body: REP-103 to aerospace axes
+_R_BODY_AERO = _R_AERO_BODY.T
 _UNKNOWN = float("nan")  # in the first entry of a covariance
 _TEXT_BYTES = 50  # of one STATUSTEXT
 _NAMES = (b"dock_brg_x", b"dock_brg_y", b"dock_range")  # at most ten bytes
@@ -60,8 +61,8 @@ def estimate(link: common.MAVLink, fix: Fix, frames: Frames, resets: int) -> com
     motion, motion_covariance = _motion(velocity)
     axes = common.MAV_FRAME_LOCAL_FRD, common.MAV_FRAME_BODY_FRD
     kind = common.MAV_ESTIMATOR_TYPE_VISION
-    pose, covariances = (*place, (w, x, y, z)), (covariance, motion_covariance)
-    return link.odometry_encode(usec, *axes, *pose, *motion, *covariances, resets, kind)
+    numbers = (usec, *axes, *place, (w, x, y, z), *motion, covariance, motion_covariance)
+    return link.odometry_encode(*numbers, resets, kind)
 
 
 def _microseconds(fix: Fix) -> int:
@@ -80,7 +81,7 @@ def _pose_covariance(
 
 def _motion(velocity: BodyVelocity) -> tuple[tuple[float, ...], list[float]]:
     """Velocity and turn rate in aerospace axes, and the upper triangle of their covariance."""
-    turn = np.kron(np.eye(2), _R_BODY_AERO)
+    turn = np.kron(np.eye(2), _R_AERO_BODY)
     motion = turn @ np.concatenate([velocity.linear_m_s, velocity.angular_rad_s])
     covariance = turn @ velocity.covariance @ turn.T
     return tuple(map(float, motion)), [float(value) for value in covariance[np.triu_indices(6)]]
@@ -90,13 +91,13 @@ def landing_target(link: common.MAVLink, fix: Fix, guide: Guide, frames: Frames)
     """Where the dock's origin is from the body, in body axes; angles are those in the camera."""
     T_body_cam = frames.vehicle.T_body_cam
     p_body = T_body_cam[:3, :3] @ dock_in_cam(guide) + T_body_cam[:3, 3]
-    place = tuple(map(float, _R_BODY_AERO @ p_body))
+    place = tuple(map(float, _R_AERO_BODY @ p_body))
     distance = math.hypot(*place)  # ArduPilot divides the place by it to have a direction
     angles = guide.bearing_x_rad, guide.bearing_y_rad
     no_size, no_orientation = (0.0, 0.0), (0.0,) * 4
     frame, kind = common.MAV_FRAME_BODY_FRD, common.LANDING_TARGET_TYPE_LIGHT_BEACON
-    head = _microseconds(fix), 0, frame
-    return link.landing_target_encode(*head, *angles, distance, *no_size, *place, no_orientation, kind, 1)
+    numbers = (_microseconds(fix), 0, frame, *angles, distance, *no_size, *place, no_orientation)
+    return link.landing_target_encode(*numbers, kind, position_valid=1)
 
 
 def dock_in_cam(guide: Guide) -> Array:
