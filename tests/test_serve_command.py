@@ -45,9 +45,10 @@ def test_live_gives_the_fixes_of_a_replay(sequence, tmp_path, listener):
     out, err = served.communicate(timeout=60)
     assert (served.returncode, err) == (0, ""), out
     assert rows(tmp_path / "live") == rows(tmp_path / "run")
-    found = [m for m in listener.read() if m.get_type() == "VISION_POSITION_ESTIMATE"]
+    poses = {"VISION_POSITION_ESTIMATE": "usec", "ODOMETRY": "time_usec"}
+    found = [m for m in listener.read() if m.get_type() in poses]
     valid = [row for row in rows(tmp_path / "run") if row["valid"] == "1" and row["status"] != "coasting"]
-    assert [m.usec for m in found] == [int(row["t_ns"]) // 1000 for row in valid]
+    assert [getattr(m, poses[m.get_type()]) for m in found] == [int(row["t_ns"]) // 1000 for row in valid]
     for message, row in zip(found, valid, strict=True):
         assert abs(-message.x - float(row["z_m"]) - 0.8) < 0.1
     live, replayed = (json.loads((tmp_path / name / "run.json").read_text()) for name in ("live", "run"))

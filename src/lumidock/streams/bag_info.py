@@ -65,9 +65,9 @@ def _by_name(pictures: str) -> list[str]:
 
 
 def _shares_its_namespace(pictures: str, others: set[str]) -> bool:
-    """Whether pictures beside these may be another camera's: left and right, not image_raw and image_rect."""
-    forms = [name for name in (pictures, *others) if _space(name) == _space(pictures)]
-    return len(forms) > 1 and not all(name.rpartition("/")[2].startswith("image") for name in forms)
+    """Whether pictures beside these may be another camera's, as left and right; a namespace belongs to its image_raw."""
+    beside = any(_space(other) == _space(pictures) for other in others)
+    return beside and not pictures.rpartition("/")[2].startswith("image")
 
 
 def _space(topic: str) -> str:
