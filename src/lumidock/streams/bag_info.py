@@ -65,7 +65,7 @@ def _by_name(pictures: str) -> list[str]:
 
 
 def _shares_its_namespace(pictures: str, others: set[str]) -> bool:
-    """Whether pictures beside these may be another camera's, as left and right; a namespace belongs to its image_raw."""
+    """Whether pictures beside these may be another camera's, as left and right; to image_raw its namespace belongs."""
     beside = any(_space(other) == _space(pictures) for other in others)
     return beside and not pictures.rpartition("/")[2].startswith("image")
 

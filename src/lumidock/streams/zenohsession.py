@@ -27,7 +27,7 @@ def open_session(endpoint: str) -> zenoh.Session:
         {
             "mode": "peer",
             "connect/endpoints": [endpoint],
-            "connect/timeout_ms": 0,
+            "connect/timeout_ms": -1,  # again and again, in the background
             "connect/exit_on_failure": False,
             "connect/retry": {"period_init_ms": _RETRY_MS, "period_max_ms": _RETRY_MS},
             "listen/endpoints": [],
