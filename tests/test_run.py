@@ -20,7 +20,7 @@ from lumidock.paper import PaperLocalizer
 from lumidock.sim.scenario import load_scenario
 from lumidock.sim.sequence import write_detections, write_rendered
 from lumidock.station import load_station
-from lumidock.streams.run_folder import RunFolder, sha256
+from lumidock.streams.run_folder import FIX_COLUMNS, RunFolder, sha256
 from lumidock.streams.sources import open_source
 
 CAMERA = Camera(320, 256, np.array([[273.0, 0, 159.5], [0, 273.0, 127.5], [0, 0, 1]]))
@@ -89,7 +89,8 @@ def column(out, name):
 def without_latency(out):
     """Content of all files of a run, latencies dropped."""
     contents = {path.name: path.read_bytes() for path in out.iterdir()}
-    contents["fixes.csv"] = [line.rsplit(b",", 1)[0] for line in contents["fixes.csv"].splitlines()]
+    table, at = [line.split(b",") for line in contents["fixes.csv"].splitlines()], FIX_COLUMNS.index("latency_us")
+    contents["fixes.csv"] = [row[:at] + row[at + 1 :] for row in table]
     description = json.loads(contents["run.json"])
     del description["counts"]["latency_us"]
     return contents | {"run.json": description}
