@@ -280,7 +280,7 @@ class Server:
     def serve(self, ready: Callable[[], None] = lambda: None) -> None:
         """Localize the newest frame, over and over, until told to stop or the recording ends.
 
-        `ready` is called when every sink has been opened, well or not.
+        `ready` is called once, when every sink has been opened, well or not.
         """
         stage: Stage = "search"
         gc.collect()
@@ -290,10 +290,13 @@ class Server:
         ready_s = time.monotonic() + _OPENING_S
         for worker in self.workers:  # a sink that is slow to open would lag from the first frame on
             worker.tried.wait(max(0.0, ready_s - time.monotonic()))
-        ready()
         self.camera.start()
+        told = False
         try:
             while not self.stop.is_set():
+                if not told and all(worker.tried.is_set() for worker in self.workers):
+                    ready()
+                    told = True
                 taken = self.newest.get(0.1)
                 if taken is not None:
                     stage = self._localize(taken, stage)

@@ -23,7 +23,7 @@ WANTED = "zenoh:[tcp/HOST:PORT]/TOPIC or dds:/TOPIC"
 _ENDPOINT = "tcp/127.0.0.1:7447"  # where rmw_zenohd listens
 _TYPES = {"": IMAGE, "compressed": COMPRESSED}  # by how image_transport ends the name of a topic
 _LOST_S = 5.0  # without a picture a topic is taken for lost
-_CALIBRATION_S = 5.0  # that a CameraInfo is waited for, which drivers send with every picture
+_CALIBRATION_S = 10.0  # that a CameraInfo is waited for, which drivers send with every picture
 
 
 class Listening(Protocol):
