@@ -26,6 +26,7 @@ from bench import (
     lamp_weights,
     learned_matcher,
     nominal,
+    ports,
     rendering,
     reproduced,
     speed,
@@ -36,6 +37,7 @@ from bench import (
 BENCHES = {
     "acquisition": acquisition,
     "nominal": nominal,
+    "ports": ports,
     "association": association,
     "table1": table1,
     "images": images,

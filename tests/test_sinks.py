@@ -86,7 +86,7 @@ def test_an_mcap_holds_what_the_run_says(run, sequence, vehicle, tmp_path):
     assert set(found) == {
         *("/lumidock/pose", "/lumidock/status", "/tf", "/lumidock/camera_info", "/diagnostics"),
         *("/lumidock/body_pose", "/lumidock/odometry", "/detected_dock_pose"),
-        *("/lumidock/image/compressed", "/lumidock/annotations"),
+        *("/lumidock/image/compressed", "/lumidock/annotations", "/lumidock/velocity"),
     }
     valid = [row for row in table if row["valid"] == "1"]
     assert len(valid) >= 3

@@ -54,9 +54,9 @@ from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
 from lumidock.streams.run_folder import RunFolder
-from lumidock.streams.sensors import AidingFeed
+from lumidock.streams.sensors import AidingFeed, SensorFeed
 from lumidock.streams.sinks import FILE_KINDS, Numbered, Setting, open_rerun
-from lumidock.streams.source import Network
+from lumidock.streams.source import Network, Source
 from lumidock.streams.vehicle import load_vehicle
 
 _LOOPBACK, _ENDPOINT = "127.0.0.1", re.compile(r"(tcp|udp|tls|quic)/[^/?#]+:[0-9]{1,5}")
@@ -92,6 +92,12 @@ MavlinkHeading = Annotated[
         min=-180.0,
         max=360.0,
         help="Compass heading of a vehicle that faces the dock head-on: the local frame is then north, east, down.",
+    ),
+]
+SensorsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--sensors", metavar="HOST:PORT", help="Listen there for ATTITUDE and VISION_POSITION_DELTA by UDP, as aiding."
     ),
 ]
 ZenohOption = Annotated[
@@ -141,6 +147,7 @@ def _serve(
     mavlink_id: MavlinkId = "1:197",
     mavlink_key: MavlinkKey = None,
     mavlink_heading: MavlinkHeading = None,
+    sensors: SensorsOption = None,
     zenoh: ZenohOption = None,
     dds: Annotated[bool, typer.Option("--dds", help="Publish to ROS 2 by DDS.")] = False,
     domain: Annotated[int, typer.Option(metavar="N", min=0, max=232, help="ROS_DOMAIN_ID.")] = 0,
@@ -173,6 +180,7 @@ def _serve(
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
         ]
         server = _server(recording, _ready_localizer(setting, recording), sinks, loop=loop)
+        server.feed = _sensor_feed(stack, recording.source, sensors)
         page = stack.enter_context(closing(_health_page(host, health_port, server)))
         # last of all, so that a start that fails leaves what is on the disk alone
         sinks += [*_record_sinks(setting, record or [], force), *_folder_sinks(out, recording, setting, server, force)]
@@ -195,7 +203,7 @@ def _server(recording: Recording, localizer: methods.Method, sinks: list[Worker]
     stop, newest, opened, lens = threading.Event(), Newest(), recording.source, recording.calibration.camera
     read = partial(opened.items, (lens.width, lens.height))
     reader = SourceReader(read, newest, live=opened.live, loop=loop, stop=stop)
-    return Server(localizer, reader, newest, sinks, stop, feed=AidingFeed(opened.sensors()))
+    return Server(localizer, reader, newest, sinks, stop)
 
 
 def _serve_until_stopped(server: Server) -> None:
@@ -271,6 +279,21 @@ def _ros_sinks(setting: Setting, zenoh: str | None, dds: Network | None, domain:
             from lumidock.streams.ddslink import DdsLink
         workers.append(Worker("dds", partial(DdsLink, dds.domain, dds.everywhere, *shared), queue=_SHORT))
     return workers
+
+
+def _sensor_feed(stack: ExitStack, opened: Source, sensors: str | None) -> SensorFeed:
+    """The sensors of an autopilot, until the stack is closed; else those of a recording."""
+    if sensors is None:
+        return AidingFeed(opened.sensors())
+    with extra("mavlink"):
+        from lumidock.streams.mavlink_sensors import MavlinkSensors
+    host, port = _host_and_port("--sensors", sensors)
+    try:
+        feed = MavlinkSensors(host, port)
+    except OSError as error:
+        raise InputError(f"--sensors {sensors}: {error.strerror or error}") from None
+    stack.callback(feed.close)
+    return feed
 
 
 def _viewer_sinks(setting: Setting, foxglove_port: int | None, rerun: str | None, host: str) -> list[Worker]:

@@ -51,7 +51,7 @@ class Publication:
     def messages(
         self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None, *, picture: bool = True
     ) -> Iterator[Serialized]:
-        """The messages of one frame; a pose and its transform only where the pose is valid."""
+        """The messages of one frame: a pose and its transform where that is valid, a velocity where it is known."""
         if item.t_ns is None:
             return
         t_ns = item.t_ns
@@ -61,6 +61,11 @@ class Publication:
             yield from self._slowly(fix, t_ns)
         if fix.T_dock_cam is not None:
             yield from self._pose(fix, fix.T_dock_cam, t_ns)
+        if fix.velocity is not None:
+            covariance = known(fix.velocity.covariance)
+            twist = _twist(fix.velocity.linear_m_s, fix.velocity.angular_rad_s, covariance)
+            stamped = make("geometry_msgs/msg/TwistWithCovarianceStamped", header(t_ns, self._cam), twist)
+            yield serialized(f"{PREFIX}/velocity", t_ns, stamped)
         if picture and isinstance(item, Frame):
             if self._camera.port is None:  # CameraInfo has no words for a port
                 yield serialized(f"{PREFIX}/camera_info", t_ns, rospicture.camera_info(self._camera, t_ns, self._cam))
@@ -91,7 +96,7 @@ class Publication:
             covariance = J @ fix.covariance @ J.T
         where, head = pose_with_covariance(T_dock_body, covariance), header(t_ns, self._dock)
         yield serialized(f"{PREFIX}/body_pose", t_ns, make("geometry_msgs/msg/PoseWithCovarianceStamped", head, where))
-        odometry = make("nav_msgs/msg/Odometry", head, vehicle.body_frame, where, _twist(fix, vehicle))
+        odometry = make("nav_msgs/msg/Odometry", head, vehicle.body_frame, where, _twist_of_body(fix, vehicle))
         yield serialized(f"{PREFIX}/odometry", t_ns, odometry)
 
     def _slowly(self, fix: Fix, t_ns: int) -> Iterator[Serialized]:
@@ -139,10 +144,14 @@ def _transforms(topic: str, t_ns: int, transform: Any) -> Serialized:  # noqa: A
     return serialized(topic, t_ns, make("tf2_msgs/msg/TFMessage", [transform]))
 
 
-def _twist(fix: Fix, vehicle: Vehicle) -> Any:  # noqa: ANN401
+def _twist(linear_m_s: Array, angular_rad_s: Array, covariance: Array) -> Any:  # noqa: ANN401
+    vectors = (make("geometry_msgs/msg/Vector3", *map(float, part)) for part in (linear_m_s, angular_rad_s))
+    return make("geometry_msgs/msg/TwistWithCovariance", make("geometry_msgs/msg/Twist", *vectors), covariance)
+
+
+def _twist_of_body(fix: Fix, vehicle: Vehicle) -> Any:  # noqa: ANN401
     """Motion in axes of the body; zero with huge variances where it is not known."""
     velocity = body_velocity(fix, vehicle)
-    linear, angular = (np.zeros(3),) * 2 if velocity is None else (velocity.linear_m_s, velocity.angular_rad_s)
-    vectors = (make("geometry_msgs/msg/Vector3", *map(float, part)) for part in (linear, angular))
-    covariance = known(None if velocity is None else velocity.covariance)
-    return make("geometry_msgs/msg/TwistWithCovariance", make("geometry_msgs/msg/Twist", *vectors), covariance)
+    if velocity is None:
+        return _twist(np.zeros(3), np.zeros(3), known(None))
+    return _twist(velocity.linear_m_s, velocity.angular_rad_s, known(velocity.covariance))

@@ -61,6 +61,7 @@ PREFIX, DOCK_POSE = "/lumidock", "/detected_dock_pose"  # where nav2's docking s
 TYPES = {
     f"{PREFIX}/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
     f"{PREFIX}/body_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    f"{PREFIX}/velocity": "geometry_msgs/msg/TwistWithCovarianceStamped",
     f"{PREFIX}/odometry": "nav_msgs/msg/Odometry",
     DOCK_POSE: "geometry_msgs/msg/PoseStamped",
     f"{PREFIX}/status": "lumidock_msgs/msg/Status",
