@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_run import CAMERA
 from zenoh.ext import Int64, z_deserialize
 
-from lumidock.datatypes import Fix, Frame
+from lumidock.datatypes import Fix, Frame, Velocity
 from lumidock.streams import rostypes
 from lumidock.streams.rostypes import dds_name
 from lumidock.streams.vehicle import Vehicle
@@ -20,7 +20,8 @@ from lumidock.streams.zenohlink import ZenohLink
 
 T = np.diag([1.0, -1, -1, 1])
 T[:3, 3] = [0.25, -0.5, 6.0]
-FIX = Fix("a", 1_700_000_000_123_456_789, "tracking", "rear", 3, 3, T, covariance=np.eye(6) * 0.01)
+VELOCITY = Velocity(np.array([0.0, 0.0, 0.4]), np.zeros(3), np.eye(6) * 0.01)
+FIX = Fix("a", 1_700_000_000_123_456_789, "tracking", "rear", 3, 3, T, covariance=np.eye(6) * 0.01, velocity=VELOCITY)
 MOUNTED = Vehicle(AHEAD, mounting_transform=True)
 FRAME = Frame("a", FIX.t_ns, np.zeros((256, 320), np.uint8))
 
