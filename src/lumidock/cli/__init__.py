@@ -188,7 +188,7 @@ def _run(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find the camera's pose in every frame of SOURCE; of several, each into a folder of its own in DIR."""
+    """Find the camera's pose in every frame of SOURCE."""
     from lumidock.cli.recordings import RunOptions
 
     require_method(method)
@@ -206,6 +206,7 @@ def _run(
 def _run_one(source: str, out: Path, options: RunOptions, *, force: bool, as_json: bool) -> None:
     from lumidock.cli.recordings import open_recording, run_recording
 
+    options.settings()  # before anything is simulated
     if source.startswith(SIM):
         require_folder(out, force)
         source, force = str(simulated(source, out / "sequence", options.station, options.camera)), True

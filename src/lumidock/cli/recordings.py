@@ -25,7 +25,7 @@ from lumidock.config import Config, load_config
 from lumidock.datatypes import Fix
 from lumidock.errors import InputError, LumidockError
 from lumidock.methods import localizer_of
-from lumidock.station import load_station
+from lumidock.station import Station, load_station
 from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.source import Item, Network, Reading, Source
 
@@ -55,6 +55,10 @@ class RunOptions:
         more = {"as_stored": self.as_stored, "trusted": self.trusted, "follow_calibration": self.camera is None}
         return Reading(self.fps, self.topic, self.info_topic, self.bits, **more)
 
+    def settings(self) -> Config:
+        """The settings of the file that was given, or the defaults. Raises: InputError."""
+        return load_config(self.config) if self.config else Config()
+
     def as_read(self) -> dict[str, Any]:
         """What of them decides about pictures and stamps, for run.json."""
         names = ("topic", "info_topic", "bits", "fps", "as_stored", "delay_ms", "camera_name", "trusted")
@@ -67,6 +71,7 @@ class Recording:
 
     source: Source
     station_file: Path
+    station: Station
     calibration: Calibration
     config: Config
     options: RunOptions
@@ -87,9 +92,9 @@ def open_recording(source: str, options: RunOptions, network: Network | None = N
     reading, delay_ms, station = options.reading(), options.delay_ms, options.station
     opened = open_any(source, reading, delay_ms=delay_ms, station=station, network=network)
     station_file = file_of("station", options.station, opened.station, opened)
+    dock = load_station(station_file)
     calibration = calibration_of(options.camera, opened, name=options.camera_name, trusted=options.trusted)
-    config = load_config(options.config) if options.config else Config()
-    return Recording(opened, station_file, calibration, config, options)
+    return Recording(opened, station_file, dock, calibration, options.settings(), options)
 
 
 def run_recording(
@@ -104,7 +109,7 @@ def run_recording(
     Raises: InputError when no row could be used, or where another process is writing there.
     """
     options, lens = recording.options, recording.calibration.camera
-    dock, done = load_station(recording.station_file), 0
+    dock, done = recording.station, 0
     localizer = localizer_of(options.method, dock, lens, recording.config, cold=options.cold)
     with RunFolder(out, dock.ids) as folder:
         copy(recording.station_file, out / "station.yaml")

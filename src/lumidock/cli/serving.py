@@ -51,7 +51,6 @@ from lumidock.cli.shared import (
 )
 from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
-from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
 from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.sensors import AidingFeed, SensorFeed
@@ -166,6 +165,7 @@ def _serve(
     mounting = load_vehicle(vehicle) if vehicle else None
     read_as = (topic, info_topic, bits, fps, as_stored, delay_ms, camera_name)
     options = RunOptions(station, camera, method, False, *read_as, trusted=trust_calibration, config=config)
+    options.settings()  # before anything is simulated
     network = Network(domain, host != _LOOPBACK)
     with ExitStack() as stack:
         if source.startswith(SIM):
@@ -173,7 +173,7 @@ def _serve(
             source = str(simulated(source, folder / "sequence", station, camera))
         recording = open_recording(source, options, network)
         tell(recording.notes)
-        setting = Setting(load_station(recording.station_file), recording.calibration.camera, mounting)
+        setting = Setting(recording.station, recording.calibration.camera, mounting)
         sinks = [
             *_mavlink_sinks(setting, mavlink, mavlink_id, mavlink_key, mavlink_heading),
             *_ros_sinks(setting, zenoh, network if dds else None, domain),

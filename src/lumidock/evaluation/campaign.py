@@ -222,7 +222,7 @@ def run_campaign(
     total, frames, seconds = len(campaign.shards), 0, 0.0
     progress(total - len(todo), total)
     workers = os.cpu_count() or 1 if workers is None else workers
-    for file, result in results(run_shard, dict(todo), workers, cluster):
+    for file, result in results(run_shard, dict(todo), workers, cluster, called="shards"):
         write_whole(out / "shards" / file, json.dumps(result))
         del todo[file]
         frames, seconds = frames + result["tally"]["counts"]["frames"], seconds + result["seconds"]

@@ -19,7 +19,12 @@ _Result = TypeVar("_Result")
 
 
 def results(
-    work: Callable[[_Job], _Result], jobs: Mapping[str, _Job], workers: int, cluster: str | None = None
+    work: Callable[[_Job], _Result],
+    jobs: Mapping[str, _Job],
+    workers: int,
+    cluster: str | None = None,
+    *,
+    called: str = "jobs",
 ) -> Iterator[tuple[str, _Result]]:
     """Name and result of each job as it is finished; when a worker dies, the jobs that are left go to a new pool.
 
@@ -37,7 +42,7 @@ def results(
                 yield name, result
         if not left:
             return
-    raise LumidockError(f"workers died {_MAX_POOLS} times; {len(left)} jobs are left")
+    raise LumidockError(f"workers died {_MAX_POOLS} times; {len(left)} {called} are left")
 
 
 def _pooled(pool: Executor, work: Callable[[_Job], _Result], jobs: Mapping[str, _Job]) -> Iterator[tuple[str, _Result]]:
