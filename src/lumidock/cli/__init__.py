@@ -213,11 +213,12 @@ def _run_one(source: str, out: Path, options: RunOptions, *, force: bool, as_jso
     recording = open_recording(source, options)
     tell(recording.notes)
     warn_if_nothing_is_kept()
+    localizer = recording.localizer()
     _require_another_folder(out, recording.source.path)
     prepare_folder(out, force)
     left = f"{out} holds a complete row for every frame so far; `run` with --force begins again"
     with told_at_interrupt(left), progress_bar("run") as progress, interrupts_held() as let_interrupt:
-        counts = run_recording(recording, out, progress=progress, let_interrupt=let_interrupt)
+        counts = run_recording(recording, localizer, out, progress=progress, let_interrupt=let_interrupt)
     _print_counts(counts, out, as_json)
 
 

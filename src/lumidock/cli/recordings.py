@@ -24,7 +24,7 @@ from lumidock.cli.shared import (
 from lumidock.config import Config, load_config
 from lumidock.datatypes import Fix
 from lumidock.errors import InputError, LumidockError
-from lumidock.methods import localizer_of
+from lumidock.methods import Method, localizer_of
 from lumidock.station import Station, load_station
 from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.source import Item, Network, Reading, Source
@@ -81,6 +81,11 @@ class Recording:
         """What a person should know of it."""
         return (*self.source.notes, *self.calibration.warnings)
 
+    def localizer(self) -> Method:
+        """The method that was asked for. Raises: InputError for a dock that it cannot use."""
+        options = self.options
+        return localizer_of(options.method, self.station, self.calibration.camera, self.config, cold=options.cold)
+
     def setup(self, camera_file: Path) -> Setup:
         """What identifies a run of it beside its source, `camera_file` with the calibration as it is kept."""
         options, files = self.options, (self.config, self.station_file, camera_file)
@@ -99,6 +104,7 @@ def open_recording(source: str, options: RunOptions, network: Network | None = N
 
 def run_recording(
     recording: Recording,
+    localizer: Method,
     out: Path,
     *,
     progress: Report = lambda _done, _total: None,
@@ -108,9 +114,7 @@ def run_recording(
 
     Raises: InputError when no row could be used, or where another process is writing there.
     """
-    options, lens = recording.options, recording.calibration.camera
-    dock, done = recording.station, 0
-    localizer = localizer_of(options.method, dock, lens, recording.config, cold=options.cold)
+    dock, lens, done = recording.station, recording.calibration.camera, 0
     with RunFolder(out, dock.ids) as folder:
         copy(recording.station_file, out / "station.yaml")
         camera_file = keep_camera(recording.calibration, out / "camera.yaml")
@@ -169,8 +173,9 @@ def run_job(job: Job) -> Outcome:
         counts = _finished(recording, job)
         if counts is not None:
             return Outcome(counts, notes=notes, kept=True)
+        localizer = recording.localizer()
         prepare_folder(job.out, force=True)
-        return Outcome(run_recording(recording, job.out), notes=notes)
+        return Outcome(run_recording(recording, localizer, job.out), notes=notes)
     except (LumidockError, OSError) as error:
         return Outcome(None, " ".join(str(error).split()), notes)
 

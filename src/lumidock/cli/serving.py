@@ -162,7 +162,6 @@ def _serve(
 ) -> None:
     """Localize live and send every fix to the vehicle, until stopped."""
     require_method(method)
-    mounting = load_vehicle(vehicle) if vehicle else None
     read_as = (topic, info_topic, bits, fps, as_stored, delay_ms, camera_name)
     options = RunOptions(station, camera, method, False, *read_as, trusted=trust_calibration, config=config)
     options.settings()  # before anything is simulated
@@ -173,7 +172,7 @@ def _serve(
             source = str(simulated(source, folder / "sequence", station, camera))
         recording = open_recording(source, options, network)
         tell(recording.notes)
-        setting = Setting(recording.station, recording.calibration.camera, mounting)
+        setting = Setting(recording.station, recording.calibration.camera, load_vehicle(vehicle) if vehicle else None)
         sinks = [
             *_mavlink_sinks(setting, mavlink, mavlink_id, mavlink_key, mavlink_heading),
             *_ros_sinks(setting, zenoh, network if dds else None, domain),
