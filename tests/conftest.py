@@ -1,5 +1,6 @@
 """What the tests share: seeded draws, strategies for SE(3), numeric derivatives, closeness, refusals, a small run."""
 
+import json
 import math
 import shutil
 import socket
@@ -11,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import zenoh
 from commandline import PAPER
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -147,6 +149,20 @@ def earlier(lumidock, bare, tmp_path):
     """An earlier run over it."""
     assert lumidock("run", bare, *PAPER, "--out", tmp_path / "earlier")[0] == 0
     return tmp_path / "earlier"
+
+
+@pytest.fixture
+def router():
+    """A zenoh session that listens on this machine, as a router would, and its endpoint."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    config = zenoh.Config()
+    listening = {"mode": "router", "listen/endpoints": [endpoint], "scouting/multicast/enabled": False}
+    for key, value in listening.items():
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config) as session:
+        yield SimpleNamespace(session=session, endpoint=endpoint)
 
 
 @pytest.fixture

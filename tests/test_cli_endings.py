@@ -6,7 +6,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from commandline import PAPER, fixes, start, wait_for
+from commandline import PAPER, PLAIN, fixes, start, wait_for
 from test_run import simulate
 
 
@@ -65,6 +65,41 @@ def test_an_interrupted_simulation_can_be_done_again(lumidock, tmp_path):
     assert err.splitlines()[-1].startswith(f"lumidock: interrupted; {tmp_path / 'sim'} holds an incomplete sequence")
     assert lumidock("run", tmp_path / "sim", "--out", tmp_path / "run")[0] == 2
     assert lumidock("sim", "trials", "--detections", "--out", tmp_path / "sim", "--force")[0] == 0
+
+
+def group(pid):
+    """Processes of the group of a process that has begun its own."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[2]) == pid and fields[0] != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("command", "number"), [("serve", signal.SIGTERM), ("run", signal.SIGTERM), ("sim", signal.SIGKILL)]
+)
+def test_a_rendering_that_is_ended_leaves_no_process_and_no_temporary_folder(tmp_path, command, number):
+    (tmp_path / "tmp").mkdir()
+    environment = PLAIN | {"TMPDIR": str(tmp_path / "tmp")}
+    words = {
+        "serve": ["sim:approach", "--health-port", "0"],
+        "run": ["sim:approach", "--out", tmp_path / "run"],
+        "sim": ["approach", "--out", tmp_path / "sim", "--workers", "2"],
+    }
+    process = start(command, *words[command], env=environment)
+    wait_for(lambda: len(list(tmp_path.rglob("frames/*"))) > 2)
+    os.kill(process.pid, number)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out) == (143 if number == signal.SIGTERM else -number, "")
+    assert "Traceback" not in err
+    wait_for(lambda: not group(process.pid), 10)
+    if number == signal.SIGTERM:
+        assert list((tmp_path / "tmp").iterdir()) == []
 
 
 @pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["eval", "RUN", "TRUTH"]], ids=" ".join)

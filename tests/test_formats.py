@@ -3,8 +3,10 @@
 `python tests/test_formats.py` writes it anew.
 """
 
+import shutil
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import bags
@@ -13,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import zstandard
-from test_packets import encoded
+from test_packets import FFMPEG, VIDEO, encoded, foxglove_file, package_bag
 
 from lumidock.camera import Camera
 from lumidock.datatypes import MOSAICS, Frame
@@ -21,8 +23,10 @@ from lumidock.errors import LumidockError
 from lumidock.setup.calibration_files import read_calibration
 from lumidock.streams.address import address_of
 from lumidock.streams.live import open_live
+from lumidock.streams.ros import Message
 from lumidock.streams.source import Reading
 from lumidock.streams.sources import open_source
+from lumidock.streams.topics import frames_of
 
 PAGE = Path(__file__).parent.parent / "docs" / "formats-supported.md"
 W, H, START = 12, 8, 1_700_000_000 * 10**9
@@ -172,8 +176,43 @@ def turned(folder):
     return told(open_source(folder, Reading(10.0)))
 
 
+def packaged(kind, form):
+    return lambda folder: told(open_source(package_bag(folder / "a", kind, form, encoded("libx264"))))
+
+
+def of_foxglove(topic):
+    return lambda folder: told(open_source(foxglove_file(folder / "a.mcap", encoded("libx264")), Reading(topic=topic)))
+
+
+def split(folder):
+    for number in range(2):
+        part = bags.write(folder / f"part{number}", "mcap", [(TOPIC, START + number, bags.raw(START, GRAY, "mono8"))])
+        (file,) = part.glob("*.mcap")
+        file.rename(folder / f"dive_{number}.mcap")
+        shutil.rmtree(part)
+    (folder / "metadata.yaml").write_text("")
+    return told(open_source(folder))
+
+
 def live(address):
-    return lambda _: f"read: {open_live(address).kind}, live"
+    return lambda _: f"read: {open_live(address, reading=Reading(follow_calibration=False)).kind}, live"
+
+
+def topic(made):
+    """A picture of a topic as it comes over a network."""
+
+    def run(_):
+        built = made(START)(bags.STORES[2])
+        data = bytes(bags.STORES[2].serialize_cdr(built, built.__msgtype__))
+
+        def listen(_topics, take):
+            take(Message(TOPIC, built.__msgtype__, "cdr", START, data))
+            return SimpleNamespace(problem="", close=lambda: None)
+
+        item = next(frames_of(listen, {TOPIC: built.__msgtype__}, Reading(), None))
+        return told(SimpleNamespace(items=lambda: iter([item]), notes=()))
+
+    return run
 
 
 def hidden(_):
@@ -183,10 +222,11 @@ def hidden(_):
 FULL = {"width": 24, "height": 16}
 BINNED = {**FULL, "binning_x": 2, "binning_y": 2, "k": np.array([30.0, 0, 11.5, 0, 30, 7.5, 0, 0, 1])}
 WINDOW = {**FULL, "roi": (6, 4, W, H), "k": np.array([15.0, 0, 11.5, 0, 15, 7.5, 0, 0, 1])}
-TRUSTED = Reading(trusted=True)
+TRUSTED, TWELVE = Reading(trusted=True), Reading(bits=12)
 P = np.array([[20.0, 0, 5.5, 0], [0, 20.0, 3.5, 0], [0, 0, 1, 0]]).reshape(-1)
 HALF = np.array([[15.0, 0, 2.5], [0, 15.0, 1.5], [0, 0, 1]]).reshape(-1)
 IMAGE = raw(GRAY, "mono8")
+JPEG = cv2.imencode(".jpg", COLOR)[1].tobytes()
 ENCODINGS = ["mono8", "mono16", "bgr8", "rgb8", "bgra8", "rgba8", *(f"{m}{b}" for m in MOSAICS[:1] for b in (8, 16))]
 ENCODINGS += ["yuyv", "uyvy", "yuv422", "yuv422_yuy2", "nv12", "nv21", "i420", "mono10", "mono12", "Mono10p", "Mono12p"]
 ENCODINGS += ["Mono12Packed", "BayerRG12p", "BayerRG12Packed", "32FC1"]
@@ -217,6 +257,14 @@ SOURCES = [
     ("Bag", "CompressedImage: JPEG", still(".jpg", COLOR)),
     ("Bag", "CompressedImage: H.264", packets("libx264", "h264")),
     ("Bag", "CompressedImage: H.265", packets("libx265", "hevc")),
+    ("Bag", "foxglove_msgs/CompressedVideo", packaged(VIDEO, "h264")),
+    ("Bag", "ffmpeg_image_transport_msgs/FFMPEGPacket", packaged(FFMPEG, "h264;yuv420p;bgr8;bgr8")),
+    ("Bag", "MCAP of Foxglove (protobuf): CompressedVideo", of_foxglove("/cam/video")),
+    ("Bag", "MCAP of Foxglove (protobuf): RawImage", of_foxglove("/raw/image")),
+    ("Bag", "MCAP of Foxglove (protobuf): CompressedImage", of_foxglove("/png/image")),
+    ("Bag", "MCAP in several files", split),
+    ("Bag", "12 bits at the top of 16, with --bits 12", bag("mcap", raw(DEEP // 16 * 16, "mono16"), reading=TWELVE)),
+    ("Bag", "12 bits at the bottom of 16, with --bits 12", bag("mcap", raw(DEEP // 16, "mono16"), reading=TWELVE)),
     ("Bag", "stamps of zero", bag("mcap", lambda _: bags.raw(0, GRAY, "mono8"))),
     ("Bag", "stamps of a simulation", bag("mcap", lambda t: bags.raw(t - START + 5, GRAY, "mono8"))),
     *(("Image encoding", name, message(name)) for name in ENCODINGS),
@@ -232,6 +280,12 @@ SOURCES = [
     ("Camera", "rtp://HOST:PORT", live("rtp://127.0.0.1:5600")),
     ("Camera", "/dev/videoN", live("/dev/video0")),
     ("Camera", "gige:NAME", live("gige:front")),
+    ("Topic of ROS 2", "zenoh:/TOPIC", live("zenoh:/cam/image_raw")),
+    ("Topic of ROS 2", "zenoh:tcp/HOST:PORT/TOPIC", live("zenoh:tcp/127.0.0.1:7447/cam/image_raw")),
+    ("Topic of ROS 2", "dds:/TOPIC", live("dds:/cam/image_raw/compressed")),
+    ("Topic of ROS 2", "Image", topic(IMAGE)),
+    ("Topic of ROS 2", "CompressedImage: JPEG", topic(lambda t: bags.compressed(t, JPEG, "jpeg"))),
+    ("Topic of ROS 2", "CompressedImage: H.264", topic(lambda t: bags.compressed(t, encoded("libx264")[0][1], "h264"))),
     ("Camera", "secrets in an address", hidden),
 ]  # fmt: skip
 
@@ -272,6 +326,10 @@ and take the time that can be read in a picture from the picture's stamp; the me
 point outside the middle half of the picture or at the middle of a picture of another size, a field of view beyond any
 lens, pixels twice as wide as high. `run` and `serve` warn of what `lumidock calib check` warns of. A recording ends
 where its calibration changes, unless `--camera` is given.
+
+**Topics.** A topic of ROS 2 is read live over zenoh or DDS. The newest picture is localized, older ones are dropped.
+Its calibration is the CameraInfo beside it, which is waited for, or `--camera`. It is lost after five seconds without a
+picture, and looked for again.
 """
 
 

@@ -1,47 +1,29 @@
 """Fixes over zenoh and DDS, as another session of the same libraries gets them; foreign clients are in test_peers."""
 
-import json
 import platform
 import re
-import socket
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import zenoh
 from commandline import AHEAD, wait_for
 from conftest import assert_close
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_run import CAMERA
 from zenoh.ext import Int64, z_deserialize
 
-from lumidock.datatypes import Fix, Frame
-from lumidock.streams import ros2
+from lumidock.datatypes import Fix, Frame, Velocity
+from lumidock.streams import rostypes
+from lumidock.streams.rostypes import dds_name
 from lumidock.streams.vehicle import Vehicle
-from lumidock.streams.zenohlink import ZenohLink, dds_name
+from lumidock.streams.zenohlink import ZenohLink
 
 T = np.diag([1.0, -1, -1, 1])
 T[:3, 3] = [0.25, -0.5, 6.0]
-FIX = Fix("a", 1_700_000_000_123_456_789, "tracking", "rear", 3, 3, T, covariance=np.eye(6) * 0.01)
+VELOCITY = Velocity(np.array([0.0, 0.0, 0.4]), np.zeros(3), np.eye(6) * 0.01)
+FIX = Fix("a", 1_700_000_000_123_456_789, "tracking", "rear", 3, 3, T, covariance=np.eye(6) * 0.01, velocity=VELOCITY)
+MOUNTED = Vehicle(AHEAD, mounting_transform=True)
 FRAME = Frame("a", FIX.t_ns, np.zeros((256, 320), np.uint8))
-
-
-@pytest.fixture
-def router():
-    """A zenoh session that listens on this machine, as a router would, and what it receives by key."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    config = zenoh.Config()
-    for key, value in {
-        "mode": "router",
-        "listen/endpoints": [endpoint],
-        "scouting/multicast/enabled": False,
-    }.items():
-        config.insert_json5(key, json.dumps(value))
-    with zenoh.open(config) as session:
-        yield SimpleNamespace(session=session, endpoint=endpoint)
 
 
 def test_ros2_messages_go_over_zenoh(router):
@@ -52,13 +34,13 @@ def test_ros2_messages_go_over_zenoh(router):
     watcher = router.session.liveliness().declare_subscriber(
         "@ros2_lv/5/**", lambda sample: tokens.append(str(sample.key_expr)), history=True
     )
-    link = ZenohLink(router.endpoint, 5, CAMERA, Vehicle(AHEAD), ("A",))
+    link = ZenohLink(router.endpoint, 5, CAMERA, MOUNTED, ("A",))
     wait_for(lambda: len(tokens) >= 8)
 
     def all_received():
         link.add(FRAME, FIX, 1500)
         time.sleep(0.05)
-        return len(received) == 7
+        return len(received) == len(rostypes.TYPES)
 
     wait_for(all_received)
     link.close()
@@ -100,10 +82,10 @@ def test_ros2_messages_go_over_dds():
 
     from lumidock.streams.ddslink import DdsLink, dds_type
 
-    link = DdsLink(78, False, CAMERA, Vehicle(AHEAD), ("A",))
+    link = DdsLink(78, False, CAMERA, MOUNTED, ("A",))
     participant = DomainParticipant(78)
     readers = {
-        topic: DataReader(participant, Topic(participant, f"rt{topic}", dds_type(ros2.TYPES[topic])))
+        topic: DataReader(participant, Topic(participant, f"rt{topic}", dds_type(rostypes.TYPES[topic])))
         for topic in ("/lumidock/pose", "/tf", "/tf_static")
     }
     found = {}
@@ -119,20 +101,20 @@ def test_ros2_messages_go_over_dds():
     link.close()
     pose = found["/lumidock/pose"]
     assert (pose.header.frame_id, pose.pose.pose.position.z, pose.pose.covariance[0]) == ("dock", 6.0, 0.01)
-    assert found["/tf"].transforms[0].child_frame_id == "camera_optical"
-    assert found["/tf_static"].transforms[0].child_frame_id == "base_link"
+    assert found["/tf"].transforms[0].child_frame_id == "dock"
+    assert found["/tf_static"].transforms[0].child_frame_id == "camera_optical"
 
 
 def test_the_status_message_is_its_own_documentation():
     store = get_typestore(Stores.ROS2_JAZZY)
-    store.register(get_types_from_msg(ros2.STATUS_MSG, "lumidock_msgs/msg/Status"))
-    assert store.hash_rihs01("lumidock_msgs/msg/Status") == ros2.type_hash("lumidock_msgs/msg/Status")
-    lines = ros2.STATUS_MSG.splitlines()[1:]
+    store.register(get_types_from_msg(rostypes.STATUS_MSG, "lumidock_msgs/msg/Status"))
+    assert store.hash_rihs01("lumidock_msgs/msg/Status") == rostypes.type_hash("lumidock_msgs/msg/Status")
+    lines = rostypes.STATUS_MSG.splitlines()[1:]
     assert all("#" in line for line in lines)
 
 
 def test_a_known_hash_is_found_again():
     # std_msgs/String of ROS 2, as `ros2 topic info --verbose` prints it
-    assert ros2.type_hash("std_msgs/msg/String") == (
+    assert rostypes.type_hash("std_msgs/msg/String") == (
         "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
     )

@@ -5,11 +5,14 @@ import threading
 import time
 from fractions import Fraction
 from itertools import islice
+from pathlib import Path
+from tempfile import gettempdir
 
 import av
 import numpy as np
 import pytest
 
+from lumidock.errors import InputError
 from lumidock.streams.live import open_live
 
 RATE, COUNT, WANTED = 30, 120, 60
@@ -42,6 +45,25 @@ def send(port, burst, stop):
                 for packet in held:
                     container.mux(packet)
                 held = []
+
+
+def test_rtp_and_rtcp_are_listened_for_on_the_address_that_was_given_alone():
+    port, before = free_port(), set(Path(gettempdir()).glob("lumidock-*"))
+    reader = threading.Thread(target=take_nothing, args=(port,), daemon=True)
+    reader.start()
+    places = set()
+    while len(places) < 2:
+        lines = [line.split()[1] for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
+        places = {place for place in lines if int(place.rpartition(":")[2], 16) in (port, port + 1)}
+        time.sleep(0.01)
+    assert {place.partition(":")[0] for place in places} == {"0100007F"}
+    reader.join()
+    assert set(Path(gettempdir()).glob("lumidock-*")) <= before
+
+
+def take_nothing(port):
+    with pytest.raises(InputError):
+        next(open_live(f"rtp://127.0.0.1:{port}").items())
 
 
 @pytest.mark.parametrize("burst", [1, 12])

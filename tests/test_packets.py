@@ -107,8 +107,8 @@ DEFINITIONS = {  # as the packages have them
 }
 
 
-@pytest.mark.parametrize(("kind", "form"), [(VIDEO, "h264"), (FFMPEG, "libx264"), (FFMPEG, "h264;yuv420p;bgr8;bgr8")])
-def test_messages_of_other_packages_are_read(tmp_path, h264, kind, form):
+def package_bag(path, kind, form, packets):
+    """A bag with video in messages of another package."""
     store = bags.STORES[2]
     if kind not in store.types:
         store.register(get_types_from_msg(DEFINITIONS[kind], kind))
@@ -122,29 +122,36 @@ def test_messages_of_other_packages_are_read(tmp_path, h264, kind, form):
 
         return message
 
-    path = bags.write(tmp_path / "a", "mcap", [("/cam/video", START + i, make(i, d)) for i, d in h264])
-    items = list(open_source(path).items())
+    return bags.write(path, "mcap", [("/cam/video", START + i, make(i, d)) for i, d in packets])
+
+
+@pytest.mark.parametrize(("kind", "form"), [(VIDEO, "h264"), (FFMPEG, "libx264"), (FFMPEG, "h264;yuv420p;bgr8;bgr8")])
+def test_messages_of_other_packages_are_read(tmp_path, h264, kind, form):
+    items = list(open_source(package_bag(tmp_path / "a", kind, form, h264)).items())
     assert [item.t_ns - START for item in items] == list(range(6))
     assert np.abs(np.subtract(levels(items), LEVELS)).max() <= 3
     assert kind in typestore("cdr").types
 
 
-def test_protobuf_of_foxglove_is_read(tmp_path, h264):
-    path, t = tmp_path / "a.mcap", Timestamp(1_700_000_000, 5)
-    gray = np.arange(64 * 48, dtype=np.uint8).reshape(48, 64)
+PICTURE = np.arange(64 * 48, dtype=np.uint8).reshape(48, 64)
+
+
+def foxglove_file(path, packets):
+    """An MCAP file of Foxglove's own messages: a calibration, video, a picture as raw pixels and as PNG."""
+    t = Timestamp(1_700_000_000, 5)
     K, P = [70.0, 0, 31, 0, 70, 23, 0, 0, 1], [70.0, 0, 31, 0, 0, 70, 23, 0, 0, 0, 1, 0]
     info = CameraCalibration(
         timestamp=t, frame_id="cam", width=64, height=48, distortion_model="plumb_bob", D=[0.1] * 5, K=K, R=K, P=P
     )
-    raw = RawImage(timestamp=t, frame_id="cam", width=64, height=48, encoding="mono8", step=64, data=gray.tobytes())
+    raw = RawImage(timestamp=t, frame_id="cam", width=64, height=48, encoding="mono8", step=64, data=PICTURE.tobytes())
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
         messages = [("/cam/camera_info", info), ("/raw/image", raw)]
         messages += [
-            ("/cam/video", CompressedVideo(timestamp=t, frame_id="cam", data=d, format="h264")) for _, d in h264
+            ("/cam/video", CompressedVideo(timestamp=t, frame_id="cam", data=d, format="h264")) for _, d in packets
         ]
-        messages += [("/png/image", CompressedImage(timestamp=t, frame_id="png", data=png(gray), format="png"))]
+        messages += [("/png/image", CompressedImage(timestamp=t, frame_id="png", data=png(PICTURE), format="png"))]
         channels = {}
         for number, (topic, message) in enumerate(messages):
             if topic not in channels:
@@ -152,12 +159,17 @@ def test_protobuf_of_foxglove_is_read(tmp_path, h264):
                 channels[topic] = writer.register_channel(topic, "protobuf", schema)
             writer.add_message(channels[topic], START + number, message.encode(), START + number)
         writer.finish()
+    return path
+
+
+def test_protobuf_of_foxglove_is_read(tmp_path, h264):
+    path = foxglove_file(tmp_path / "a.mcap", h264)
     source = open_source(path, Reading(topic="/cam/video"))
     assert np.abs(np.subtract(levels(source.items()), LEVELS)).max() <= 3
     assert source.calibration.focal_px[0] == 70.0
     for topic in ("/raw/image", "/png/image"):
         (item,) = open_source(path, Reading(topic=topic)).items()
-        assert (item.t_ns, np.array_equal(item.image, gray)) == (START + 5, True)
+        assert (item.t_ns, np.array_equal(item.image, PICTURE)) == (START + 5, True)
 
 
 def png(image):

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,11 +23,13 @@ from rosbags.typesys import Stores, get_typestore
 from test_run import simulate
 
 from lumidock.camera import Camera, load_camera, save_camera
-from lumidock.datatypes import Fix, Frame
+from lumidock.datatypes import Fix, Frame, Guide, Velocity
 from lumidock.evaluation.metrics import evaluate
+from lumidock.geometry import bearing_and_range
 from lumidock.setup.calibration_files import write_calibration
 from lumidock.streams.live import open_live
-from lumidock.streams.mavlink import Mavlink
+from lumidock.streams.mavlink import Identity, Mavlink, signing_key
+from lumidock.streams.rostypes import TYPES
 from lumidock.streams.source import Reading
 from lumidock.streams.sources import open_source
 from lumidock.streams.vehicle import load_vehicle
@@ -108,7 +111,22 @@ def test_foxgloves_decoders_read_our_mcap(made):
     assert found["/lumidock/image/compressed"][0]["content"]["data"][:2] == [0xFF, 0xD8]
     names = {text["text"] for line in found["/lumidock/annotations"] for text in line["content"]["texts"]}
     assert names == set("ABCDE")
-    assert found["/tf_static"][0]["content"]["transforms"][0]["child_frame_id"] == "base_link"
+    assert found["/tf"][0]["content"]["transforms"][0]["child_frame_id"] == "dock"
+    check_of_filters(found)
+
+
+def check_of_filters(found):
+    """What robot_localization and nav2 take, by the definitions in the file and Foxglove's decoder."""
+    odometry, body = found["/lumidock/odometry"][-1]["content"], found["/lumidock/body_pose"][-1]["content"]
+    assert (odometry["header"]["frame_id"], odometry["child_frame_id"]) == ("dock", "base_link")
+    assert odometry["pose"] == body["pose"]
+    for covariance in (odometry["twist"]["covariance"], body["pose"]["covariance"]):
+        assert (np.diag(np.reshape(covariance, (6, 6))) > 0).all()
+    dock = found["/detected_dock_pose"][-1]["content"]
+    assert dock["header"]["frame_id"] == "camera_optical"
+    assert 2.0 < dock["pose"]["position"]["z"] < 4.5  # ahead of the camera
+    (status,) = found["/diagnostics"][-1]["content"]["status"]
+    assert (status["level"], status["name"]) == (0, "lumidock: fix")
 
 
 def test_rerun_reads_our_mcap_and_verifies_our_rrd(made, tmp_path):
@@ -158,27 +176,68 @@ def test_evo_takes_our_trajectory_and_finds_the_same_error(made, tmp_path):
     assert evaluate(made / "run", made / "seq")["valid"] == len(valid)
 
 
-def test_node_mavlink_parses_what_is_sent(tmp_path):
-    (tmp_path / "vehicle.yaml").write_text(VEHICLE)
+T = np.diag([1.0, -1, -1, 1])
+T[:3, 3] = [0.3, 0.2, 6.0]
+COVARIANCE = np.diag([0.01, 0.04, 0.09, 1e-4, 1e-4, 4e-4])
+VELOCITY = Velocity(np.array([0.0, 0.1, 0.5]), np.array([0.0, 0.2, 0.0]), np.eye(6) * 0.01)
+GUIDE = Guide(*bearing_and_range(T), 0.01, 0.1)
+
+
+def sent(folder, fix, identity=None, passphrase=""):
+    """What node-mavlink makes of the messages about a fix, by their names."""
+    (folder / "vehicle.yaml").write_text(VEHICLE)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
         port.bind(("127.0.0.1", 0))
-        port.settimeout(2)
-        link = Mavlink("127.0.0.1", port.getsockname()[1], load_vehicle(tmp_path / "vehicle.yaml"))
-        T = np.diag([1.0, -1, -1, 1])
-        T[:3, 3] = [0.3, 0.2, 6.0]
-        cov = np.diag([0.01, 0.04, 0.09, 1e-4, 1e-4, 4e-4])
-        fix = Fix("a", 123_456_789_000, "tracking", "rear", T_dock_cam=T, covariance=cov)
+        port.settimeout(0.3)
+        link = Mavlink("127.0.0.1", port.getsockname()[1], load_vehicle(folder / "vehicle.yaml"), identity)
         link.tick()
         link.add(Frame("a", fix.t_ns, np.zeros((4, 4), np.uint8)), fix, 9)
-        (tmp_path / "bytes").write_bytes(port.recv(4096) + port.recv(4096))
         link.close()
-    heartbeat, estimate = node("mavlink.cjs", tmp_path / "bytes")
-    assert (heartbeat["name"], heartbeat["component"], heartbeat["content"]["type"]) == ("HEARTBEAT", 197, 18)
-    content = estimate["content"]
-    assert (estimate["name"], content["usec"]) == ("VISION_POSITION_ESTIMATE", "123456789")
+        received = []
+        with suppress(TimeoutError):
+            while True:
+                received.append(port.recv(4096))
+    (folder / "bytes").write_bytes(b"".join(received))
+    found = node("mavlink.cjs", folder / "bytes", *filter(None, [passphrase]))
+    assert len(found) == len(received)
+    return {f"{line['name']} {line['content'].get('name', '')}".strip(): line for line in found}
+
+
+def test_node_mavlink_parses_pose_and_guide(tmp_path):
+    fix = Fix("a", 123_456_789_000, "tracking", "rear", T_dock_cam=T, covariance=COVARIANCE, guide=GUIDE)
+    found = sent(tmp_path, fix)
+    heartbeat, content = found["HEARTBEAT"], found["VISION_POSITION_ESTIMATE"]["content"]
+    assert (heartbeat["system"], heartbeat["component"], heartbeat["content"]["type"]) == (1, 197, 18)
+    assert content["usec"] == "123456789"
     assert_close([content["x"], content["y"], content["z"]], [-6.8, 0.3, -0.1], atol=1e-6)
     assert_close([content["roll"], content["pitch"], content["yaw"]], [0, 0, 0], atol=1e-6)
     assert content["covariance"][0] > 0.09  # along the approach, and what the lever adds
+    target = found["LANDING_TARGET"]["content"]
+    assert_close([target["x"], target["y"], target["z"]], [6.8, -0.3, 0.1], atol=1e-6)
+    assert (target["frame"], target["positionValid"], target["timeUsec"]) == (12, 1, "123456789")
+    assert_close(target["distance"], np.linalg.norm([6.8, 0.3, 0.1]), atol=1e-6)
+    assert_close(found["NAMED_VALUE_FLOAT dock_range"]["content"]["value"], GUIDE.range_m, atol=1e-6)
+    assert found["STATUSTEXT"]["content"]["text"] == "lumidock: pose, rear"
+
+
+def test_node_mavlink_parses_odometry(tmp_path):
+    fix = Fix("a", 5_000, "tracking", "rear", T_dock_cam=T, covariance=COVARIANCE, velocity=VELOCITY)
+    content = sent(tmp_path, fix)["ODOMETRY"]["content"]
+    assert (content["frameId"], content["childFrameId"], content["estimatorType"]) == (20, 12, 2)
+    assert_close([content["x"], content["y"], content["z"]], [-6.8, 0.3, -0.1], atol=1e-6)
+    assert_close(content["q"], [1, 0, 0, 0], atol=1e-6)
+    assert_close([content["vx"], content["vy"], content["vz"]], [0.5, -0.16, 0.1], atol=1e-6)
+    assert_close([content["rollspeed"], content["pitchspeed"], content["yawspeed"]], [0, 0, 0.2], atol=1e-6)
+
+
+def test_node_mavlink_accepts_the_signature_by_the_passphrase_alone(tmp_path):
+    (tmp_path / "key").write_text("correct horse battery\n")
+    fix = Fix("a", 5_000, "tracking", "rear", T_dock_cam=T)
+    identity = Identity(7, 191, key=signing_key(tmp_path / "key"))
+    found = sent(tmp_path, fix, identity, "correct horse battery").values()
+    assert {(line["system"], line["component"], line["signed"]) for line in found} == {(7, 191, True)}
+    found = sent(tmp_path, fix, identity, "another passphrase").values()
+    assert not any(line["signed"] for line in found)
 
 
 @pytest.fixture(scope="module")
@@ -259,13 +318,13 @@ def test_foxglove_connects_to_a_server(made):
     served = serve(made / "seq", "--loop", *more)
     try:
         wait_for(lambda: socket.socket().connect_ex(("127.0.0.1", port)) == 0)
-        found = {line["topic"]: line["content"] for line in node("foxglove.cjs", port, 7)}
+        found = {line["topic"]: line["content"] for line in node("foxglove.cjs", port, len(TYPES) - 1)}
     finally:
         served.terminate()
         served.communicate()
     assert found["/lumidock/pose"]["header"]["frame_id"] == "dock"
     assert found["/lumidock/image/compressed"]["format"] == "jpeg"
-    assert len(found) == 7
+    assert set(found) == set(TYPES) - {"/tf_static"}  # which the vehicle file does not ask for
 
 
 @pytest.fixture

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from lumidock.app.run import Setup, Summary
@@ -18,7 +20,7 @@ from lumidock.paper import PaperLocalizer
 from lumidock.sim.scenario import load_scenario
 from lumidock.sim.sequence import write_detections, write_rendered
 from lumidock.station import load_station
-from lumidock.streams.run_folder import RunFolder, sha256
+from lumidock.streams.run_folder import FIX_COLUMNS, RunFolder, sha256
 from lumidock.streams.sources import open_source
 
 CAMERA = Camera(320, 256, np.array([[273.0, 0, 159.5], [0, 273.0, 127.5], [0, 0, 1]]))
@@ -87,9 +89,8 @@ def column(out, name):
 def without_latency(out):
     """Content of all files of a run, latencies dropped."""
     contents = {path.name: path.read_bytes() for path in out.iterdir()}
-    rows = [line.split(b",") for line in contents["fixes.csv"].splitlines()]
-    latency = rows[0].index(b"latency_us")
-    contents["fixes.csv"] = [row[:latency] + row[latency + 1 :] for row in rows]
+    table, at = [line.split(b",") for line in contents["fixes.csv"].splitlines()], FIX_COLUMNS.index("latency_us")
+    contents["fixes.csv"] = [row[:at] + row[at + 1 :] for row in table]
     description = json.loads(contents["run.json"])
     del description["counts"]["latency_us"]
     return contents | {"run.json": description}
@@ -224,6 +225,16 @@ def test_frames_with_a_guide_are_counted():
         summary.count(fix, 1, "")
     counts = summary.as_dict()
     assert [counts[name] for name in ("frames", "valid", "guide", "guide_only")] == [4, 2, 2, 1]
+
+
+@given(st.lists(st.integers(0, 2000), min_size=1))
+def test_latencies_are_counted_and_their_percentiles_are_the_nearest_ranks(latencies):
+    summary = Summary()
+    for us in latencies:
+        summary.count(Fix("a", 0, "none", "search", reason="too_few"), us, "")
+    ranks = {"p50": 50, "p95": 95, "p99": 99, "max": 100}
+    wanted = {name: int(np.percentile(latencies, q, method="inverted_cdf")) for name, q in ranks.items()}
+    assert summary.as_dict()["latency_us"] == wanted
 
 
 def test_a_method_is_told_the_attitude_and_the_run_remembers_its_file(tmp_path):

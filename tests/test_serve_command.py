@@ -11,11 +11,17 @@ import urllib.request
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
-from commandline import LUMIDOCK, VEHICLE, fixes, free_port, serve, wait_for
+import zenoh
+from commandline import LUMIDOCK, NO_DISTORTION, VEHICLE, fixes, free_port, serve, wait_for
 from test_run import simulate
 
 from lumidock.datatypes import Frame
+from lumidock.evaluation.metrics import evaluate
+from lumidock.report import report
+from lumidock.report.moments import images_of
+from lumidock.report.view import load_run
 from lumidock.streams.sources import open_source
 
 
@@ -39,11 +45,20 @@ def test_live_gives_the_fixes_of_a_replay(sequence, tmp_path, listener):
     out, err = served.communicate(timeout=60)
     assert (served.returncode, err) == (0, ""), out
     assert rows(tmp_path / "live") == rows(tmp_path / "run")
-    found = [m for m in listener.read() if m.get_type() == "VISION_POSITION_ESTIMATE"]
+    poses = {"VISION_POSITION_ESTIMATE": "usec", "ODOMETRY": "time_usec"}
+    found = [m for m in listener.read() if m.get_type() in poses]
     valid = [row for row in rows(tmp_path / "run") if row["valid"] == "1" and row["status"] != "coasting"]
-    assert [m.usec for m in found] == [int(row["t_ns"]) // 1000 for row in valid]
+    assert [getattr(m, poses[m.get_type()]) for m in found] == [int(row["t_ns"]) // 1000 for row in valid]
     for message, row in zip(found, valid, strict=True):
         assert abs(-message.x - float(row["z_m"]) - 0.8) < 0.1
+    live, replayed = (json.loads((tmp_path / name / "run.json").read_text()) for name in ("live", "run"))
+    assert set(replayed) <= set(live)
+    for name in ("method", "cold", "source", "inputs_sha256", "config"):
+        assert live[name] == replayed[name]
+    for name in set(replayed["counts"]) - {"latency_us"}:
+        assert live["counts"][name] == replayed["counts"][name]
+    assert set(live["counts"]["latency_us"]) == {"p50", "p95", "p99", "max"}
+    assert live["counts"]["camera"]["dropped"] == 0
     recorded = [item.t_ns for item in open_source(tmp_path / "live.mcap").items()]
     assert recorded == [int(row["t_ns"]) for row in rows(tmp_path / "run")]
 
@@ -56,6 +71,25 @@ def test_sigterm_ends_it_in_good_order(sequence, tmp_path):
     assert (served.returncode, err) == (0, ""), out
     assert len(rows(tmp_path / "live")) >= 3
     assert (tmp_path / "live.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
+
+
+def test_a_recording_that_was_shown_twice_is_evaluated_and_reported(sequence, tmp_path):
+    served = serve(sequence, "--loop", "--out", tmp_path / "live")
+    wait_for(lambda: json.loads(urllib.request.urlopen(served.url + "health.json").read())["fixes"]["frames"] >= 10)
+    served.terminate()
+    served.communicate(timeout=20)
+    table = rows(tmp_path / "live")
+    assert any(row["frame"].startswith("1.") for row in table)
+    result = evaluate(tmp_path / "live", sequence)
+    assert result["frames"] == sum(row["frames"] for row in result["by_true_z"]) == len(table)
+    assert result["hazardous"]["valid"]["any"] == 0
+    assert sum(row["frames"] for row in result["by_true_z"]) == len(table)
+    view = load_run(tmp_path / "live", sequence)
+    assert np.isfinite(view.true_position).all()
+    assert view.visible.any(axis=1).all()
+    (shown,) = images_of(view, [(len(table) - 1, "last")])
+    assert shown.jpeg_base64
+    assert "With truth" in report([tmp_path / "live"], [sequence])
 
 
 def records(folder):
@@ -82,6 +116,9 @@ def check_killed(sequence, folder, seconds):
     table = rows(folder / "live")
     assert len(table) >= frames - 4  # at four frames a second
     assert all(row["status"] and None not in row for row in table)
+    described = json.loads((folder / "live" / "run.json").read_text())
+    assert (described["live"], described["counts"]["finished"]) == (True, False)
+    assert described["counts"]["frames"] >= len(table) - 5  # a second old at most
     if frames > 4:
         for kind in ("mcap", "mp4"):
             found = [item for item in open_source(folder / f"live.{kind}").items() if isinstance(item, Frame)]
@@ -161,6 +198,72 @@ def test_everything_listens_on_this_machine_only(sequence):
     finally:
         served.terminate()
         served.communicate(timeout=20)
+
+
+def test_a_zenoh_session_without_a_router_is_said_and_its_coming_noticed(sequence):
+    port = free_port()
+    served = serve(sequence, "--loop", "--zenoh", f"tcp/127.0.0.1:{port}")
+
+    def problem():
+        health = json.loads(urllib.request.urlopen(served.url + "health.json").read())
+        return health["sinks"]["zenoh"]["problem"]
+
+    wait_for(lambda: "no zenoh router or peer answers" in problem())
+    config = zenoh.Config()
+    for key, value in {"mode": "router", "listen/endpoints": [f"tcp/127.0.0.1:{port}"]}.items():
+        config.insert_json5(key, json.dumps(value))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config):
+        wait_for(lambda: not problem())
+    served.terminate()
+    _, err = served.communicate(timeout=20)
+    assert "lumidock: warning: zenoh: no zenoh router or peer answers at tcp/127.0.0.1" in err
+
+
+def attack(sequence, folder, first, page):
+    """A second server after the folder and the ports of the first: refused in one line, with nothing touched."""
+    port = page.rstrip("/").rpartition(":")[2]
+    for more in (("--health-port", port), ("--health-port", "0", "--force"), ("--health-port", port, "--force")):
+        words = ["serve", str(sequence), "--out", str(folder / "live"), *more]
+        before = first.poll()
+        done = subprocess.run([LUMIDOCK, *words], capture_output=True, text=True, timeout=60)
+        assert before is None
+        assert (done.returncode, done.stdout) == (2, ""), done.stderr
+        assert len([line for line in done.stderr.splitlines() if not line.startswith(NO_DISTORTION)]) == 1, done.stderr
+
+
+def check_attacked(sequence, folder, seconds):
+    """Kill a server that another one attacks; every row that its health had told of is there, and nobody else's."""
+    served = serve(sequence, "--loop", "--out", folder / "live")
+    attack(sequence, folder, served, served.url)
+    time.sleep(seconds)
+    frames = json.loads(urllib.request.urlopen(served.url + "health.json").read())["fixes"]["frames"]
+    served.kill()
+    served.communicate()
+    table = rows(folder / "live")
+    assert len(table) >= frames - 4
+    names = [row["frame"] for row in table]
+    assert len(set(names)) == len(names)
+    assert all(row["status"] and None not in row for row in table)
+    again = serve(sequence, "--out", folder / "live", "--force")
+    _, err = again.communicate(timeout=60)
+    assert (again.returncode, "Traceback" in err) == (0, False)
+    assert [row["frame"] for row in rows(folder / "live")] == [f"{k:06d}" for k in range(7)]
+
+
+def test_a_second_server_touches_nothing_of_the_first(sequence, tmp_path):
+    check_attacked(sequence, tmp_path, 0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(5))
+def test_two_hundred_starts_and_kills_under_attack(sequence, tmp_path, rng, part):
+    for number in range(40):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        seconds = float(rng.uniform(0.0, 2.0))
+        print(f"part {part}, kill {number}: after {seconds:.3f} s")  # noqa: T201  # in the report of a failure
+        check_attacked(sequence, folder, seconds)
 
 
 def test_garbage_and_floods_on_every_port_are_borne(sequence, rng, listener):

@@ -58,6 +58,12 @@ def require_stamp(t_ns: object) -> None:
         raise DataError(f"t_ns is {t_ns!r}, {_type_of(t_ns)}, wanted an integer of nanoseconds")
 
 
+def in_seconds(t_ns: int) -> str:
+    """Seconds with nine decimals, exactly."""
+    whole, part = divmod(abs(t_ns), 10**9)
+    return f"{'-' if t_ns < 0 else ''}{whole}.{part:09d}"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Attitude:
     """Orientation `R_dock_cam` (3, 3) by the vehicle's own compass and tilt sensors, 1-sigma error `sigma_rad`."""

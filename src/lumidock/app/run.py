@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -20,6 +20,9 @@ from lumidock.methods import Aided, Method
 from lumidock.streams.run_folder import RunFolder, identities
 from lumidock.streams.sensors import AidingFeed, SensorFeed
 from lumidock.streams.source import Item, Source
+
+_RENEWED_S = 1.0  # between two writings of run.json while a run goes on
+_START: Stage = "search"
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +45,14 @@ class Summary:
     status: Counter[str] = field(default_factory=Counter)
     stage: Counter[str] = field(default_factory=Counter)
     reason: Counter[str] = field(default_factory=Counter)
-    nis: list[float] = field(default_factory=list)
-    exposure_factor: list[float] = field(default_factory=list)
-    latency_us: list[int] = field(default_factory=list)
+    exposure_frames: int = 0
+    too_bright: int = 0
+    too_dark: int = 0
+    log_exposure_factor: float = 0.0  # sum over these frames
     contradictions: dict[tuple[str, str], Contradicted] = field(default_factory=dict)
+    nis_sum: float = 0.0
+    nis_frames: int = 0
+    latency_us: Counter[int] = field(default_factory=Counter)  # how often each occurred: a server runs for weeks
     first_error: str = ""
     finished: bool = False
 
@@ -65,16 +72,17 @@ class Summary:
             before = self.contradictions.get(key)
             self.contradictions[key] = Contradicted(before.frames + 1 if before else 1, against.text)
         if math.isfinite(fix.nis):
-            self.nis.append(fix.nis)
+            self.nis_sum, self.nis_frames = self.nis_sum + fix.nis, self.nis_frames + 1
         if math.isfinite(fix.exposure_factor):
-            self.exposure_factor.append(fix.exposure_factor)
+            self.exposure_frames += 1
+            self.too_bright += fix.exposure_factor < 1.0
+            self.too_dark += fix.exposure_factor > 1.0
+            self.log_exposure_factor += math.log(fix.exposure_factor)
         if latency_us is not None:
-            self.latency_us.append(latency_us)
+            self.latency_us[latency_us] += 1
 
     def as_dict(self) -> dict[str, Any]:
         """For run.json; latency in microseconds, decoding excluded."""
-        quantiles = {"p50": 50, "p95": 95, "p99": 99, "max": 100}
-        latency = {name: int(np.percentile(self.latency_us, q)) for name, q in quantiles.items() if self.latency_us}
         return {
             "frames": self.frames,
             "usable": self.usable,
@@ -88,20 +96,29 @@ class Summary:
                 {"file": file, "subject": subject, "frames": one.frames, "text": one.text}
                 for (file, subject), one in sorted(self.contradictions.items(), key=lambda item: -item[1].frames)
             ],
-            "nis": {"frames": len(self.nis), "mean": sum(self.nis) / len(self.nis)} if self.nis else None,
+            "nis": {"frames": self.nis_frames, "mean": self.nis_sum / self.nis_frames} if self.nis_frames else None,
             "exposure": self._exposure(),
-            "latency_us": latency,
+            "latency_us": self._latency(),
             "finished": self.finished,
         }
 
     def _exposure(self) -> dict[str, Any] | None:
         """In how many frames the exposure was judged, too bright and too dark, and the mean of the factor it needs."""
-        asked = np.array(self.exposure_factor)
-        if not len(asked):
+        if not self.exposure_frames:
             return None
-        too_bright, too_dark = int((asked < 1.0).sum()), int((asked > 1.0).sum())
-        factor = float(np.exp(np.log(asked).mean()))
-        return {"frames": len(asked), "too_bright": too_bright, "too_dark": too_dark, "factor": round(factor, 3)}
+        factor = round(math.exp(self.log_exposure_factor / self.exposure_frames), 3)
+        counts = {"too_bright": self.too_bright, "too_dark": self.too_dark}
+        return {"frames": self.exposure_frames, **counts, "factor": factor}
+
+    def _latency(self) -> dict[str, int]:
+        """Percentiles: the smallest latency that so many frames did not exceed; empty where there are none."""
+        if not self.latency_us:
+            return {}
+        values = np.array(sorted(self.latency_us))
+        below = np.cumsum([self.latency_us[int(value)] for value in values])
+        quantiles = {"p50": 0.50, "p95": 0.95, "p99": 0.99, "max": 1.0}
+        ranks = {name: min(int(np.ceil(q * below[-1])), int(below[-1])) for name, q in quantiles.items()}
+        return {name: int(values[np.searchsorted(below, rank)]) for name, rank in ranks.items()}
 
 
 def contradictions_in_words(counts: dict[str, Any], most: int = 3) -> list[str]:
@@ -109,6 +126,58 @@ def contradictions_in_words(counts: dict[str, Any], most: int = 3) -> list[str]:
     found = counts.get("contradictions", [])
     more = [f"{len(found) - most} further contradictions are in run.json"] if len(found) > most else []
     return [f"{one['text']} ({one['file']}, {one['frames']} frames)" for one in found[:most]] + more
+
+
+class Record:
+    """A run folder, and run.json with the counts of what is in it; a crash leaves counts a second old at most."""
+
+    def __init__(
+        self, folder: RunFolder, identity: Mapping[str, Any], more: Callable[[], Mapping[str, Any]] = dict
+    ) -> None:
+        """Describe the run by its `identity`; `more` gives further counts."""
+        self.summary = Summary()
+        self._folder, self._identity, self._more = folder, identity, more
+        self._describe()
+
+    def add(self, fix: Fix, latency_us: int | None, *, t_ns: int | None, error: str = "") -> None:
+        """Append one frame. Raises: OSError when it cannot be written."""
+        self.summary.finished = False
+        self._folder.add(fix, latency_us, t_ns=t_ns)
+        self.summary.count(fix, latency_us, error)
+        self.renew()
+
+    def renew(self) -> None:
+        """Write run.json again where the last time was a second ago."""
+        if time.monotonic() - self._described_s >= _RENEWED_S:
+            self._describe()
+
+    def end(self, *, finished: bool) -> None:
+        """Write run.json with all counts."""
+        self.summary.finished = finished
+        self._describe()
+
+    def _describe(self) -> None:
+        self._described_s = time.monotonic()
+        self._folder.describe({**self._identity, "counts": self.summary.as_dict() | dict(self._more())})
+
+
+class LiveRecord:
+    """The record of a server as a sink, begun once; what a full disk did not take is missing as whole rows."""
+
+    def __init__(self, record: Record) -> None:
+        self._record = record
+
+    def add(self, item: Item, fix: Fix, latency_us: int | None) -> None:
+        """Append one frame."""
+        self._record.add(fix, latency_us, t_ns=item.t_ns)
+
+    def tick(self) -> None:
+        """Keep run.json fresh when no frames come."""
+        self._record.renew()
+
+    def close(self) -> None:
+        """Describe all that was written."""
+        self._record.end(finished=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +189,7 @@ class Setup:
     config: Config
     station: Path
     camera: Path
+    reading: Mapping[str, Any] = field(default_factory=dict)  # options that decide about pictures and stamps
 
 
 def run(
@@ -137,21 +207,19 @@ def run(
 
     Raises: InputError when not one row could be used.
     """
-    summary, identity, feed = Summary(), _identity(source, setup), AidingFeed(source.sensors())
-    folder.describe(identity | {"counts": summary.as_dict()})
-    stage: Stage = "search"
+    record, finished, feed = Record(folder, identity_of(source, setup)), False, AidingFeed(source.sensors())
+    summary, stage = record.summary, _START
     try:
         for item in source.items(size):
             aid(localizer, feed, item)
             fix, latency_us, error = process(localizer, item, "search" if setup.cold else stage)
             stage = fix.stage
-            folder.add(fix, latency_us, t_ns=item.t_ns)
-            summary.count(fix, latency_us, error)
+            record.add(fix, latency_us, t_ns=item.t_ns, error=error)
             on_fix(item, fix)
             del item  # the next picture is read into its room
-        summary.finished = True
+        finished = True
     finally:
-        folder.describe(identity | {"counts": summary.as_dict()})
+        record.end(finished=finished)
     if not summary.usable:
         raise InputError(summary.first_error or f"{source.path}: no frame in it")
     return summary
@@ -184,7 +252,7 @@ def _unusable(frame: str, t_ns: int, stage: Stage, reason: str) -> Fix:
     return Fix(frame, t_ns, "none", stage, reason=reason)
 
 
-def _identity(source: Source, setup: Setup) -> dict[str, Any]:
+def identity_of(source: Source, setup: Setup) -> dict[str, Any]:
     """What the run was made from and with; the station and the camera under the names their copies have."""
     inputs = {path.name: path for path in source.inputs}
     inputs |= {"station.yaml": setup.station, "camera.yaml": setup.camera}
@@ -194,5 +262,6 @@ def _identity(source: Source, setup: Setup) -> dict[str, Any]:
         "cold": setup.cold,
         "source": {"kind": source.kind, "name": source.path.name},
         **identities(inputs),
+        "reading": dict(setup.reading),
         "config": setup.config.model_dump(mode="json"),
     }

@@ -82,7 +82,7 @@ class SourceReader(threading.Thread):
         self, open_items: Callable[[], Iterator[Item]], newest: Newest, *, live: bool, loop: bool, stop: threading.Event
     ) -> None:
         super().__init__(name="camera", daemon=True)
-        self._open, self._newest, self._live, self._loop, self._halt = open_items, newest, live, loop, stop
+        self._open, self._newest, self._live, self.loop, self._halt = open_items, newest, live, loop, stop
         self.frames, self.reconnects, self.problem, self.ended = 0, 0, "", False
         self._offset_ns = self._passes = 0
 
@@ -94,7 +94,9 @@ class SourceReader(threading.Thread):
                 self.problem = "the stream ended" if self._live and not self._halt.is_set() else ""
             except (LumidockError, OSError) as error:
                 self.problem = str(error)
-            if not self._live and (not self._loop or self.problem):
+            except Exception as error:  # of a library's reader: told, and tried again like any other
+                self.problem = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            if not self._live and (not self.loop or self.problem):
                 break
             self._passes += 1
             if self._live:
@@ -117,7 +119,7 @@ class SourceReader(threading.Thread):
             if not self._live:  # unlike a camera, a recording would decode its next image while this one is localized
                 self._newest.wait_until_idle(_LOOK_S)
                 self._halt.wait(_YIELD_S)
-        if self._loop and first_ns is not None:
+        if self.loop and first_ns is not None:
             self._offset_ns += last_ns - first_ns + _LOOP_PAUSE_NS
             self._halt.wait(_LOOP_PAUSE_NS * 1e-9)
 
@@ -170,6 +172,7 @@ class Worker(threading.Thread):
         super().__init__(name=name, daemon=True)
         self._open, self._queue, self._stale_s = open_sink, deque[Done](maxlen=queue), stale_s
         self._pictures, self._patient = pictures, patient
+        self._skipped = deque[Fix](maxlen=_RECENT)  # fixes that were not sent, of which a sink may want to know
         self._changed, self._halt = threading.Condition(), False
         self.tried = threading.Event()  # whether the sink has been opened, well or not
         self.sent, self.dropped, self.stale, self.errors, self.problem = 0, 0, 0, 0, ""
@@ -178,7 +181,9 @@ class Worker(threading.Thread):
     def offer(self, done: Done) -> None:
         """Queue a fix, in place of the oldest where the queue is full; never waits."""
         with self._changed:
-            self.dropped += len(self._queue) == self._queue.maxlen
+            if len(self._queue) == self._queue.maxlen:
+                self.dropped += 1
+                self._skipped.append(self._queue[0].fix)
             self._queue.append(done if self._pictures else _without_picture(done))
             self._changed.notify()
 
@@ -194,6 +199,7 @@ class Worker(threading.Thread):
         while not self._over():
             try:
                 sink = self._open()
+                self.problem = getattr(sink, "problem", self.problem)
                 self.tried.set()
                 try:
                     self._feed(sink)
@@ -228,6 +234,7 @@ class Worker(threading.Thread):
                 if done is None and self._halt:
                     return
             tick()
+            self.problem = getattr(sink, "problem", self.problem)
             if done is not None:
                 if (
                     self._patient
@@ -239,11 +246,19 @@ class Worker(threading.Thread):
         age_s = time.monotonic() - done.taken.at_s
         if self._stale_s is not None and age_s > self._stale_s:
             self.stale += 1
+            self._skipped.append(done.fix)
             return
+        self._tell_skipped(sink)
         sink.add(done.taken.item, done.fix, done.latency_us)
         self.sent += 1
-        self.problem = ""
+        self.problem = getattr(sink, "problem", "")
         self.delay_s.append(time.monotonic() - done.taken.at_s)
+
+    def _tell_skipped(self, sink: Sink) -> None:
+        """Let a sink that counts acquisitions take notice of fixes that it was not given."""
+        skip: Callable[[Fix], None] = getattr(sink, "skip", lambda _fix: None)
+        while self._skipped:
+            skip(self._skipped.popleft())
 
 
 @dataclass(slots=True)
@@ -264,8 +279,11 @@ class Server:
     feed: SensorFeed = field(default_factory=lambda: AidingFeed(()))
     started_s: float = field(default_factory=time.monotonic)
 
-    def serve(self) -> None:
-        """Localize the newest frame, over and over, until told to stop or the recording ends."""
+    def serve(self, ready: Callable[[], None] = lambda: None) -> None:
+        """Localize the newest frame, over and over, until told to stop or the recording ends.
+
+        `ready` is called once, when every sink has been opened, well or not.
+        """
         stage: Stage = "search"
         gc.collect()
         gc.freeze()  # objects alive now stay alive, and scanning them would lengthen every pause of the collector
@@ -275,8 +293,12 @@ class Server:
         for worker in self.workers:  # a sink that is slow to open would lag from the first frame on
             worker.tried.wait(max(0.0, ready_s - time.monotonic()))
         self.camera.start()
+        told = False
         try:
             while not self.stop.is_set():
+                if not told and all(worker.tried.is_set() for worker in self.workers):
+                    ready()
+                    told = True
                 taken = self.newest.get(0.1)
                 if taken is not None:
                     stage = self._localize(taken, stage)
@@ -304,6 +326,12 @@ class Server:
             self.contradiction = fix.contradiction.text
         self.last = fix
         return fix.stage
+
+    def losses(self) -> dict[str, Any]:
+        """What a run folder of this server does not hold: for its run.json."""
+        queues = {worker.name: {"dropped": worker.dropped, "stale": worker.stale} for worker in self.workers}
+        camera = {"frames": self.camera.frames, "dropped": self.newest.dropped, "reconnects": self.camera.reconnects}
+        return {"camera": camera | {"problem": self.camera.problem}, "sinks": queues}
 
     def health(self) -> dict[str, Any]:
         """Rates, latencies, drops and reasons, for the page and for machines."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import io
 import json
 import os
+import signal
 import sys
 from importlib.metadata import version
-from itertools import count
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import cv2
 import typer
@@ -39,6 +39,7 @@ from lumidock.cli.shared import (
     Bits,
     CameraName,
     CameraOption,
+    Cluster,
     ConfigOption,
     DelayMs,
     Force,
@@ -47,19 +48,15 @@ from lumidock.cli.shared import (
     Method,
     Out,
     Seed,
-    SourceArgument,
+    SourcesArgument,
     StationOption,
     Topic,
     Trusted,
     Workers,
     app,
-    calibration_of,
     copy,
     example,
-    file_of,
     interrupts_held,
-    keep_camera,
-    open_any,
     prepare_folder,
     prepare_sequence,
     progress_bar,
@@ -70,12 +67,12 @@ from lumidock.cli.shared import (
     told_at_interrupt,
     warn_if_nothing_is_kept,
 )
-from lumidock.config import Config, load_config
-from lumidock.datatypes import Fix
 from lumidock.errors import InputError, LumidockError
-from lumidock.methods import METHODS, localizer_of, require_method
+from lumidock.methods import METHODS, require_method
 from lumidock.station import load_station
-from lumidock.streams.source import Item, Reading
+
+if TYPE_CHECKING:
+    from lumidock.cli.recordings import RunOptions
 
 _MAX_SEED = 10**9
 _COMMANDS = (
@@ -97,6 +94,7 @@ _COMMANDS = (
 def main() -> None:
     """Entry point: every error that the user can correct is one line and exit code 2."""
     _keep_streams_clean()
+    _clean_up_at_sigterm()
     try:
         code = app(standalone_mode=False, prog_name="lumidock")
         print(end="", flush=True)
@@ -113,6 +111,12 @@ def main() -> None:
         _drop_output()
         _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
     sys.exit(code or 0)
+
+
+def _clean_up_at_sigterm() -> None:
+    """Let SIGTERM end the program in good order: no worker and no temporary folder is left behind."""
+    if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
 
 
 def _keep_streams_clean() -> None:
@@ -160,10 +164,11 @@ def _lumidock(
         "lumidock run dive.mcap --station dock.yaml --out RUN",
         "lumidock run dive.mp4 --station dock.yaml --camera camera.yaml --out RUN",
         "lumidock run sim:approach --out RUN",
+        "lumidock run *.mcap dive.mp4 --station dock.yaml --camera camera.yaml --out RUNS --workers 4",
     ),
 )
 def _run(
-    source: SourceArgument,
+    sources: SourcesArgument,
     out: Out,
     station: StationOption = None,
     camera: CameraOption = None,
@@ -178,50 +183,89 @@ def _run(
     camera_name: CameraName = None,
     trust_calibration: Trusted = False,
     config: ConfigOption = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Find the camera's pose in every frame of SOURCE."""
-    from lumidock.app.run import Setup
-    from lumidock.app.run import run as run_source
-    from lumidock.streams.run_folder import RunFolder
+    from lumidock.cli.recordings import RunOptions
 
     require_method(method)
-    settings = load_config(config) if config else Config()
+    options = RunOptions(
+        *(station, camera, method, cold, topic, info_topic, bits, fps, as_stored, delay_ms, camera_name),
+        trusted=trust_calibration,
+        config=config,
+    )
+    if len(sources) > 1 or workers is not None or cluster is not None:
+        _run_many(sources, out, options, force=force, workers=workers, cluster=cluster, as_json=as_json)
+    else:
+        _run_one(sources[0], out, options, force=force, as_json=as_json)
+
+
+def _run_one(source: str, out: Path, options: RunOptions, *, force: bool, as_json: bool) -> None:
+    from lumidock.cli.recordings import open_recording, run_recording
+
+    options.settings()  # before anything is simulated
     if source.startswith(SIM):
         require_folder(out, force)
-        source, force = str(simulated(source, out / "sequence", station, camera)), True
-    reading = Reading(
-        fps, topic, info_topic, bits, as_stored=as_stored, trusted=trust_calibration, follow_calibration=camera is None
-    )
-    opened = open_any(source, reading, delay_ms=delay_ms, station=station)
-    station_file = file_of("station", station, opened.station, opened)
-    dock = load_station(station_file)
-    calibration = calibration_of(camera, opened, name=camera_name, trusted=trust_calibration)
-    lens = calibration.camera
-    tell((*opened.notes, *calibration.warnings))
+        source, force = str(simulated(source, out / "sequence", options.station, options.camera)), True
+    recording = open_recording(source, options)
+    tell(recording.notes)
     warn_if_nothing_is_kept()
-    localizer = localizer_of(method, dock, lens, settings, cold=cold)
-    _require_another_folder(out, opened.path)
+    localizer = recording.localizer()
+    _require_another_folder(out, recording.source.path)
     prepare_folder(out, force)
     left = f"{out} holds a complete row for every frame so far; `run` with --force begins again"
-    with (
-        told_at_interrupt(left),
-        RunFolder(out, dock.ids) as folder,
-        progress_bar("run") as progress,
-        interrupts_held() as let_interrupt,
-    ):
-        copy(station_file, out / "station.yaml")
-        camera_file = keep_camera(calibration, out / "camera.yaml")
-        setup = Setup(method, cold, settings, station_file, camera_file)
-        done = count(1)
+    with told_at_interrupt(left), progress_bar("run") as progress, interrupts_held() as let_interrupt:
+        counts = run_recording(recording, localizer, out, progress=progress, let_interrupt=let_interrupt)
+    _print_counts(counts, out, as_json)
 
-        def on_fix(_item: Item, _fix: Fix) -> None:
-            progress(next(done), opened.count)
-            let_interrupt()
 
-        summary = run_source(opened, localizer, folder, setup, on_fix=on_fix, size=(lens.width, lens.height))
-    _print_counts(summary.as_dict(), out, as_json)
+def _run_many(
+    sources: list[str],
+    out: Path,
+    options: RunOptions,
+    *,
+    force: bool,
+    workers: int | None,
+    cluster: str | None,
+    as_json: bool,
+) -> None:
+    """Run each source into a folder of its own; what an earlier call finished is kept."""
+    from lumidock.cli.recordings import Outcome, jobs_of, run_job
+    from lumidock.evaluation.workers import results
+
+    if simulations := [source for source in sources if source.startswith(SIM)]:
+        raise InputError(
+            f"{simulations[0]}: several simulations are a campaign: lumidock campaign SCENARIO --seeds A:B"
+        )
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file")
+    jobs, outcomes = jobs_of(sources, out, options, force=force), dict[str, Outcome]()
+    for job in jobs.values():
+        _require_another_folder(job.out, Path(job.source))
+    warn_if_nothing_is_kept()
+    out.mkdir(parents=True, exist_ok=True)
+    left = f"{out} holds the runs that are finished; the same command continues with the others"
+    with told_at_interrupt(left), progress_bar("run") as progress:
+        progress(0, len(jobs))
+        for name, outcome in results(run_job, jobs, os.cpu_count() or 1 if workers is None else workers, cluster):
+            outcomes[name] = outcome
+            progress(len(outcomes), len(jobs))
+    for name in jobs:
+        tell(f"{name}: {note}" for note in outcomes[name].notes)
+    if as_json:
+        print(json.dumps({n: outcomes[n].counts or {"error": outcomes[n].error} for n in jobs}, indent=2))
+    else:
+        for name, job in jobs.items():
+            if (counts := outcomes[name].counts) is not None:
+                _print_counts(counts, job.out, as_json)
+    failed = [f"{name}: {outcomes[name].error}" for name in jobs if outcomes[name].error]
+    for line in failed[:-1]:
+        print(f"lumidock: {line}", file=sys.stderr)
+    if failed:
+        raise InputError(failed[-1])
 
 
 def _require_another_folder(out: Path, source: Path) -> None:
@@ -327,9 +371,7 @@ def _campaign(
         list[str] | None, typer.Option("--set", metavar="KEY.SUBKEY=VALUE", help="Of all scenarios; may be repeated.")
     ] = None,
     workers: Workers = None,
-    cluster: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Run on the dask cluster there: tcp://HOST:PORT.")
-    ] = None,
+    cluster: Cluster = None,
     bound: Annotated[
         bool, typer.Option("--bound", help="Also count in which frames the lights in view allow a valid fix (slower).")
     ] = False,

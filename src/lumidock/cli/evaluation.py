@@ -57,9 +57,10 @@ def print_table(rows: list[dict[str, Any]]) -> None:
     print(f"{'run':{width}} {'method':>9} {'frames':>7} {'valid':>7} {'guide':>7} {'hazards':>8}", end="   ")
     print("lateral m       axial m         angle deg   (median / 95 %)")
     for row in rows:
-        hazards = sum(row["hazardous"][word]["any"] for word in ("valid", "guide"))
-        counts = f"{row['frames']:7d} {row['valid']:7d} {row['guide']:7d} {hazards:8d}"
-        print(f"{row['run']:{width}} {row['method'] or '?':>9} {counts}   {_errors(row['error'])}")
+        hazardous = row.get("hazardous")  # not known without truth
+        hazards = "-" if hazardous is None else sum(hazardous[word]["any"] for word in ("valid", "guide"))
+        counts = f"{row['frames']:7d} {row['valid']:7d} {row['guide']:7d} {hazards:>8}"
+        print(f"{row['run']:{width}} {row['method'] or '?':>9} {counts}   {_errors(row.get('error') or {})}")
 
 
 def print_evaluation(result: dict[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import signal
 import sys
@@ -10,7 +11,6 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -18,9 +18,10 @@ from typing import Annotated
 import typer
 
 from lumidock import methods
+from lumidock.app.run import LiveRecord, Record, identity_of
 from lumidock.app.serve import STALE_S, Newest, Server, SourceReader, Worker
 from lumidock.app.warm import warm_up
-from lumidock.camera import Camera, save_camera
+from lumidock.cli.recordings import Recording, RunOptions, open_recording
 from lumidock.cli.shared import (
     SIM,
     AsJson,
@@ -39,25 +40,22 @@ from lumidock.cli.shared import (
     Trusted,
     VehicleOption,
     app,
-    calibration_of,
     copy,
     example,
-    file_of,
-    open_any,
+    keep_camera,
     prepare_folder,
     require_new,
     simulated,
     tell,
     warn_if_nothing_is_kept,
 )
-from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
-from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
+from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.sensors import AidingFeed, SensorFeed
-from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, open_rerun
-from lumidock.streams.source import Reading, Source
+from lumidock.streams.sinks import FILE_KINDS, Numbered, Setting, open_rerun
+from lumidock.streams.source import Network, Source
 from lumidock.streams.vehicle import load_vehicle
 
 _LOOPBACK, _ENDPOINT = "127.0.0.1", re.compile(r"(tcp|udp|tls|quic)/[^/?#]+:[0-9]{1,5}")
@@ -69,12 +67,31 @@ LiveSource = Annotated[
     str,
     typer.Argument(
         metavar="SOURCE",
-        help="rtsp://..., rtp://HOST:PORT, /dev/videoN, gige:[NAME], sim:SCENARIO, or a recording at its own pace.",
+        help="rtsp://..., rtp://HOST:PORT, /dev/videoN, gige:[NAME], zenoh:/TOPIC, dds:/TOPIC, sim:SCENARIO, or a "
+        "recording at its own pace.",
     ),
 ]
 MavlinkOption = Annotated[
     str | None,
-    typer.Option("--mavlink", metavar="HOST:PORT", help="Send VISION_POSITION_ESTIMATE by UDP; needs --vehicle."),
+    typer.Option("--mavlink", metavar="HOST:PORT", help="Send poses, bearing and range by UDP; needs --vehicle."),
+]
+MavlinkId = Annotated[
+    str,
+    typer.Option("--mavlink-id", metavar="SYSTEM[:COMPONENT]", help="Who speaks; the system is the autopilot's."),
+]
+MavlinkKey = Annotated[
+    Path | None,
+    typer.Option("--mavlink-key", metavar="FILE", help="Sign with the passphrase in the first line of FILE."),
+]
+MavlinkHeading = Annotated[
+    float | None,
+    typer.Option(
+        "--mavlink-heading",
+        metavar="DEG",
+        min=-180.0,
+        max=360.0,
+        help="Compass heading of a vehicle that faces the dock head-on: the local frame is then north, east, down.",
+    ),
 ]
 SensorsOption = Annotated[
     str | None,
@@ -126,6 +143,9 @@ def _serve(
     config: ConfigOption = None,
     loop: Annotated[bool, typer.Option("--loop", help="Show a recording again and again.")] = False,
     mavlink: MavlinkOption = None,
+    mavlink_id: MavlinkId = "1:197",
+    mavlink_key: MavlinkKey = None,
+    mavlink_heading: MavlinkHeading = None,
     sensors: SensorsOption = None,
     zenoh: ZenohOption = None,
     dds: Annotated[bool, typer.Option("--dds", help="Publish to ROS 2 by DDS.")] = False,
@@ -142,59 +162,64 @@ def _serve(
 ) -> None:
     """Localize live and send every fix to the vehicle, until stopped."""
     require_method(method)
-    settings = load_config(config) if config else Config()
+    read_as = (topic, info_topic, bits, fps, as_stored, delay_ms, camera_name)
+    options = RunOptions(station, camera, method, False, *read_as, trusted=trust_calibration, config=config)
+    options.settings()  # before anything is simulated
+    network = Network(domain, host != _LOOPBACK)
     with ExitStack() as stack:
         if source.startswith(SIM):
-            folder = stack.enter_context(tempfile.TemporaryDirectory())
-            source = str(simulated(source, Path(folder) / "sequence", station, camera))
-        reading = Reading(fps, topic, info_topic, bits, as_stored=as_stored, trusted=trust_calibration)
-        reading = replace(reading, follow_calibration=camera is None)
-        opened = open_any(source, reading, delay_ms=delay_ms, station=station)
-        station_file = file_of("station", station, opened.station, opened)
-        calibration = calibration_of(camera, opened, name=camera_name, trusted=trust_calibration)
-        tell((*opened.notes, *calibration.warnings))
-        setting = Setting(load_station(station_file), calibration.camera, load_vehicle(vehicle) if vehicle else None)
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            source = str(simulated(source, folder / "sequence", station, camera))
+        recording = open_recording(source, options, network)
+        tell(recording.notes)
+        setting = Setting(recording.station, recording.calibration.camera, load_vehicle(vehicle) if vehicle else None)
         sinks = [
-            *_vehicle_sinks(setting, mavlink, zenoh, domain if dds else None, domain, host),
+            *_mavlink_sinks(setting, mavlink, mavlink_id, mavlink_key, mavlink_heading),
+            *_ros_sinks(setting, zenoh, network if dds else None, domain),
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
         ]
-        server = _server(opened, _ready_localizer(method, setting, settings), setting.camera, sinks, loop=loop)
-        server.feed = _sensor_feed(stack, opened, sensors)
+        server = _server(recording, _ready_localizer(setting, recording), sinks, loop=loop)
+        server.feed = _sensor_feed(stack, recording.source, sensors)
         page = stack.enter_context(closing(_health_page(host, health_port, server)))
         # last of all, so that a start that fails leaves what is on the disk alone
-        sinks += _file_sinks(setting, station_file, out, record or [], force)
+        sinks += [*_record_sinks(setting, record or [], force), *_folder_sinks(out, recording, setting, server, force)]
         print(f"health at http://{host}:{page.port}/", file=sys.stderr if as_json else sys.stdout, flush=True)
-        with _stopped_by_signals(server.stop):
-            server.serve()
-    _print_counts(server, as_json)
-    if server.camera.problem and not opened.live:
-        raise InputError(server.camera.problem)
+        _serve_until_stopped(server)
+    _print_end(server, as_json, live=recording.source.live)
 
 
-def _ready_localizer(name: str, setting: Setting, settings: Config) -> methods.Method:
+def _ready_localizer(setting: Setting, recording: Recording) -> methods.Method:
     """A localizer whose kernels are compiled."""
     warn_if_nothing_is_kept()
-    dock, lens = setting.station, setting.camera
-    list(warm_up(localizer_of(name, dock, lens, settings).process, dock, lens))
-    return localizer_of(name, dock, lens, settings)
+    dock, lens, name = setting.station, setting.camera, recording.options.method
+    list(warm_up(localizer_of(name, dock, lens, recording.config).process, dock, lens))
+    return localizer_of(name, dock, lens, recording.config)
 
 
-def _server(opened: Source, localizer: methods.Method, lens: Camera, sinks: list[Worker], *, loop: bool) -> Server:
+def _server(recording: Recording, localizer: methods.Method, sinks: list[Worker], *, loop: bool) -> Server:
     """A server of the newest frame of a source, which nothing has started yet."""
     sys.setswitchinterval(_SWITCH_S)
-    stop, newest = threading.Event(), Newest()
+    stop, newest, opened, lens = threading.Event(), Newest(), recording.source, recording.calibration.camera
     read = partial(opened.items, (lens.width, lens.height))
     reader = SourceReader(read, newest, live=opened.live, loop=loop, stop=stop)
     return Server(localizer, reader, newest, sinks, stop)
 
 
-def _print_counts(server: Server, as_json: bool) -> None:
-    """The counts of all that was served, for people or as JSON."""
+def _serve_until_stopped(server: Server) -> None:
+    """Serve, and say which sinks have nobody to send to."""
+    with _stopped_by_signals(server.stop):
+        server.serve(lambda: tell(f"{sink.name}: {sink.problem}" for sink in server.workers if sink.problem))
+
+
+def _print_end(server: Server, as_json: bool, *, live: bool) -> None:
+    """The counts of all that was served, for people or as JSON. Raises: InputError for a recording that broke off."""
     counts, dropped = server.counts, server.newest.dropped
     if as_json:
         print(json.dumps({word: counts[word] for word in ("frames", "valid", "guide")} | {"dropped": dropped}))
     else:
         print(f"{counts['frames']} frames: {counts['valid']} valid; {dropped} came too fast and were dropped")
+    if server.camera.problem and not live:
+        raise InputError(server.camera.problem)
 
 
 def _health_page(host: str, port: int, server: Server) -> HealthPage:
@@ -217,19 +242,31 @@ def _stopped_by_signals(stop: threading.Event) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _vehicle_sinks(
-    setting: Setting, mavlink: str | None, zenoh: str | None, dds: int | None, domain: int, host: str
+def _mavlink_sinks(
+    setting: Setting, mavlink: str | None, who: str, key: Path | None, heading_deg: float | None
 ) -> list[Worker]:
+    if mavlink is None:
+        return []
+    if setting.vehicle is None:
+        raise InputError("--mavlink needs --vehicle FILE: an autopilot wants the pose of the vehicle's body")
+    with extra("mavlink"):
+        from lumidock.streams.mavlink import Identity, Mavlink, ResetCounter, signing_key
+    name, port = _host_and_port("--mavlink", mavlink)
+    system, _, component = who.partition(":")
+    if not all(word.isdecimal() and 0 < int(word) < 256 for word in (system, component or "197")):
+        raise InputError(f"--mavlink-id {who}: wanted SYSTEM or SYSTEM:COMPONENT, each from 1 to 255")
+    identity = Identity(
+        int(system),
+        int(component or "197"),
+        math.radians(heading_deg or 0.0),
+        signing_key(key) if key is not None else None,
+    )
+    link = partial(Mavlink, name, port, setting.vehicle, identity, ResetCounter())
+    return [Worker("mavlink", link, queue=1, stale_s=STALE_S, pictures=False)]
+
+
+def _ros_sinks(setting: Setting, zenoh: str | None, dds: Network | None, domain: int) -> list[Worker]:
     workers, shared = [], (setting.camera, setting.vehicle, setting.station.ids)
-    if mavlink is not None:
-        if setting.vehicle is None:
-            raise InputError("--mavlink needs --vehicle FILE: an autopilot wants the pose of the vehicle's body")
-        with extra("mavlink"):
-            from lumidock.streams.mavlink import Mavlink
-        name, port = _host_and_port("--mavlink", mavlink)
-        workers.append(
-            Worker("mavlink", partial(Mavlink, name, port, setting.vehicle), queue=1, stale_s=STALE_S, pictures=False)
-        )
     if zenoh is not None:
         if not _ENDPOINT.fullmatch(zenoh):
             raise InputError(f"--zenoh {zenoh}: wanted an endpoint, as tcp/127.0.0.1:7447 is one")
@@ -239,7 +276,7 @@ def _vehicle_sinks(
     if dds is not None:
         with extra("dds"), extra("bag"):
             from lumidock.streams.ddslink import DdsLink
-        workers.append(Worker("dds", partial(DdsLink, dds, host != _LOOPBACK, *shared), queue=_SHORT))
+        workers.append(Worker("dds", partial(DdsLink, dds.domain, dds.everywhere, *shared), queue=_SHORT))
     return workers
 
 
@@ -273,22 +310,27 @@ def _viewer_sinks(setting: Setting, foxglove_port: int | None, rerun: str | None
     return workers
 
 
-def _file_sinks(
-    setting: Setting, station_file: Path, out: Path | None, record: list[Path], force: bool
+def _folder_sinks(
+    out: Path | None, recording: Recording, setting: Setting, server: Server, force: bool
 ) -> list[Worker]:
+    """A run folder, locked and described. Raises: InputError where another process is writing a run there."""
+    if out is None:
+        return []
+    prepare_folder(out, force)
+    folder = RunFolder(out, setting.station.ids)
+    copy(recording.station_file, out / "station.yaml")
+    camera_file = keep_camera(recording.calibration, out / "camera.yaml")
+    identity = identity_of(recording.source, recording.setup(camera_file)) | {"live": True, "loop": server.camera.loop}
+    live = LiveRecord(Record(folder, identity, server.losses))
+    return [Worker(out.name, lambda: live, queue=_ROWS, pictures=False)]
+
+
+def _record_sinks(setting: Setting, record: list[Path], force: bool) -> list[Worker]:
     for path in record:
         if path.suffix not in FILE_KINDS:
             raise InputError(f"--record {path}: not one of {', '.join(FILE_KINDS)}")
         require_new(path, force)
-    workers = []
-    if out is not None:
-        prepare_folder(out, force)
-        folder = RunSink(out, setting.station.ids)
-        copy(station_file, out / "station.yaml")
-        save_camera(setting.camera, out / "camera.yaml")
-        workers.append(Worker(out.name, lambda: folder, queue=_ROWS, pictures=False))
-    workers += [Worker(path.name, Numbered(path, setting).open, queue=_LONG, patient=True) for path in record]
-    return workers
+    return [Worker(path.name, Numbered(path, setting).open, queue=_LONG, patient=True) for path in record]
 
 
 def _host_and_port(option: str, text: str) -> tuple[str, int]:

@@ -29,7 +29,7 @@ from lumidock.camera import Camera, load_camera, save_camera
 from lumidock.errors import InputError
 from lumidock.station import load_station
 from lumidock.streams.live import open_live
-from lumidock.streams.source import Reading, Source, delayed
+from lumidock.streams.source import Network, Reading, Source, delayed
 from lumidock.streams.sources import open_source
 from lumidock.yamlfile import kind_of_file
 
@@ -48,6 +48,7 @@ _SIMULATED = (
     "lights_truth.csv",
     "spurious_truth.csv",
     "stream_truth.csv",
+    "truth.tum",
 )
 
 SCENARIOS = ", ".join(sorted(Path(entry.name).stem for entry in (files("lumidock") / "sim" / "scenarios").iterdir()))
@@ -68,11 +69,16 @@ VehicleOption = Annotated[
     Path | None, typer.Option("--vehicle", metavar="FILE", help="Vehicle file: frame names and the camera's mounting.")
 ]
 Topic = Annotated[str | None, typer.Option("--topic", metavar="NAME", help="The pictures of a bag that has several.")]
-SourceArgument = Annotated[
-    str,
+SourcesArgument = Annotated[
+    list[str],
     typer.Argument(
-        metavar="SOURCE", help="Sequence or image folder, video, bag, sim:SCENARIO[:SEED], or a camera's address."
+        metavar="SOURCE...",
+        help="Sequence or image folder, video, bag, sim:SCENARIO[:SEED], or a camera's address; several recordings.",
     ),
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option("--cluster", metavar="ADDRESS", help="Run on the dask cluster there: tcp://HOST:PORT."),
 ]
 Method = Annotated[
     str, typer.Option("--method", metavar="NAME", help="lumidock, paper, a baseline, or one of an installed package.")
@@ -195,13 +201,21 @@ def prepare_sequence(folder: Path, force: bool) -> None:
     truth.write_bytes(b"")  # marks the folder as simulated, also when the simulation is cut short
 
 
-def open_any(source: str, reading: Reading, *, delay_ms: float = 0.0, station: str | None = None) -> Source:
+def open_any(
+    source: str,
+    reading: Reading,
+    *,
+    delay_ms: float = 0.0,
+    station: str | None = None,
+    network: Network | None = None,
+) -> Source:
     """A recording by its path or a camera by its address; no colour is read for a `station` of white lights alone."""
     if not -_MAX_DELAY_MS <= delay_ms <= _MAX_DELAY_MS:
         raise InputError(f"--delay-ms {delay_ms:g}: wanted a time within {_MAX_DELAY_MS:g} ms")
     gray = station is not None and set(load_station(file_given("station", station)).color) == {"white"}
     reading = replace(reading, gray=gray)
-    return delayed(open_live(source, gray=gray) or open_source(Path(source), reading), delay_ms)
+    live = open_live(source, gray=gray, reading=reading, network=network)
+    return delayed(live or open_source(Path(source), reading), delay_ms)
 
 
 @dataclass(frozen=True, slots=True)

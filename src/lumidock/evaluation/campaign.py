@@ -11,17 +11,11 @@ import hashlib
 import json
 import os
 import re
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
-from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +28,7 @@ from lumidock.errors import InputError, LumidockError
 from lumidock.evaluation.campaign_table import markdown, row_of
 from lumidock.evaluation.counts import SimulatedRun, Tally, tally_run
 from lumidock.evaluation.cramer_rao import Bound
+from lumidock.evaluation.workers import results
 from lumidock.methods import Aided, Method, implementation, localizer_of
 from lumidock.sim.detections import SimulatedFrame, simulated_frames
 from lumidock.sim.scenario import Scenario, station_of
@@ -41,7 +36,6 @@ from lumidock.station import Station, load_station
 from lumidock.yamlfile import validate
 
 _SEEDS_PER_SHARD = 5
-_MAX_POOLS = 4  # a worker that dies breaks its pool; after so many broken pools the campaign is given up
 Progress = Callable[[int, int | None], None]
 
 
@@ -229,90 +223,12 @@ def run_campaign(
     total, frames, seconds = len(campaign.shards), 0, 0.0
     progress(total - len(todo), total)
     workers = os.cpu_count() or 1 if workers is None else workers
-    for shard, result in _results(list(todo.values()), workers, cluster):
-        write_whole(out / "shards" / shard.file, json.dumps(result))
-        del todo[shard.file]
+    for file, result in results(run_shard, dict(todo), workers, cluster, called="shards"):
+        write_whole(out / "shards" / file, json.dumps(result))
+        del todo[file]
         frames, seconds = frames + result["tally"]["counts"]["frames"], seconds + result["seconds"]
         progress(total - len(todo), total)
     return frames / seconds if seconds else float("nan")
-
-
-def _results(shards: list[Shard], workers: int, cluster: str | None) -> Iterator[tuple[Shard, dict[str, Any]]]:
-    """Counts of shards as they are finished; when a worker dies, the shards that are left go to a new pool."""
-    if cluster is None and not workers:
-        yield from ((shard, run_shard(shard)) for shard in shards)
-        return
-    left = {shard.file: shard for shard in shards}
-    for _ in range(_MAX_POOLS):
-        with worker_pool(workers, cluster) as pool:
-            for shard, result in _pooled(pool, list(left.values())):
-                del left[shard.file]
-                yield shard, result
-        if not left:
-            return
-    raise LumidockError(f"workers died {_MAX_POOLS} times; {len(left)} shards are left")
-
-
-def _pooled(pool: Executor, shards: list[Shard]) -> Iterator[tuple[Shard, dict[str, Any]]]:
-    """Counts of shards as they are finished, except those whose worker died."""
-    futures: dict[Future[dict[str, Any]], Shard] = {}
-    try:
-        for shard in shards:
-            futures[pool.submit(run_shard, shard)] = shard
-    except BrokenProcessPool:
-        pass  # the futures of the shards that were submitted raise the same error below
-    for future in as_completed(futures):
-        try:
-            result = future.result()
-        except Exception as error:
-            if not _worker_died(error):
-                raise
-        else:
-            yield futures[future], result
-
-
-def _worker_died(error: Exception) -> bool:
-    """Whether the worker died; dask's own error is recognised by its name, since dask need not be installed."""
-    return isinstance(error, (BrokenProcessPool, CancelledError)) or type(error).__name__ == "KilledWorker"
-
-
-@contextmanager
-def worker_pool(workers: int, cluster: str | None) -> Iterator[Executor]:
-    """Worker processes on this machine, or those of a dask cluster."""
-    if cluster is not None:
-        with _dask_client(cluster) as client:
-            yield client.get_executor()
-        return
-    spawn = get_context("spawn")  # a fork would inherit the locks of OpenCV's threads
-    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=_start_worker) as pool:
-        try:
-            yield pool
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _dask_client(address: str) -> Any:  # noqa: ANN401
-    try:
-        from distributed import Client
-    except ImportError:
-        raise InputError("--cluster needs dask distributed: pip install 'lumidock[cluster]'") from None
-    try:
-        return Client(address, timeout="10s", set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"--cluster {address}: {error or type(error).__name__}") from None
-
-
-def _start_worker() -> None:
-    """Let a worker end silently at Ctrl-C, and when its parent process ends."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _read_shard(out: Path, shard: Shard) -> dict[str, Any] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -18,12 +19,13 @@ from lumidock.datatypes import Array
 from lumidock.errors import InputError
 from lumidock.evaluation import claims
 from lumidock.evaluation.claims import GuideClaims, PoseClaims
-from lumidock.evaluation.run_description import description_if_any, mean_nis, source_kind
+from lumidock.evaluation.run_description import description_if_any, mean_nis, source_kind, with_passes
 from lumidock.geometry import pose_from_quat, se3_inverse, transform_points
 from lumidock.station import Station, load_station
 from lumidock.streams.run_folder import COVARIANCE_COLUMNS, GUIDE_COLUMNS, PROTECTION_COLUMNS
 
 _POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+_COLUMNS = ("frame", "t_ns", "valid", "reason", *_POSE)
 _SAME_DETECTION_PX = 3.0  # a detection this close to a light's true centre was made by it
 _STAMPED = ("sequence", "detections", "bag")  # sources whose times are not made up or measured anew
 _STAMP = re.compile(r"-?[0-9]{1,18}")
@@ -49,10 +51,30 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
     """
     folder = truth if truth.is_dir() else truth.parent
     true, path = true_poses(truth), run_folder / "fixes.csv"
-    fixes = read_rows(path, ("frame", "t_ns", "valid", "reason", *_POSE))
+    fixes = read_rows(path, _COLUMNS)
+    true = with_passes(true, (row["frame"] for row in fixes))
     description = description_if_any(run_folder)
     _require_same_frames(truth, fixes, true, stamped=source_kind(description) in _STAMPED)
     poses = {row["frame"]: _pose(path, row) for row in fixes if row["valid"] == "1"}
+    result = _counted(path, fixes, description)
+    known = [row for row in fixes if row["frame"] in true]
+    result |= _errors_and_claims(path, known, true, _alert_limits(run_folder))
+    if (run_folder / "layers.csv").exists():
+        result["layers"] = _layers(run_folder, true)
+    if (folder / "lights_truth.csv").exists():
+        result["identities"] = _identities(run_folder, folder, true)
+    if all((run_folder / name).exists() for name in ("lights.csv", "station.yaml", "camera.yaml")):
+        result["residual_rms_px"] = _residual_rms_px(run_folder, poses)
+    return result
+
+
+def count_run(run_folder: Path) -> dict[str, Any]:
+    """What can be said of a run folder without truth: the part of `evaluate` that needs none. Raises: InputError."""
+    path = run_folder / "fixes.csv"
+    return _counted(path, read_rows(path, _COLUMNS), description_if_any(run_folder))
+
+
+def _counted(path: Path, fixes: list[Row], description: Mapping[str, Any]) -> dict[str, Any]:
     gaps = {word: claims.continuity(_stamps(path, fixes, word)) for word in ("valid", "guide")}
     result: dict[str, Any] = {
         "frames": len(fixes),
@@ -65,14 +87,6 @@ def evaluate(run_folder: Path, truth: Path) -> dict[str, Any]:
     }
     result["availability"] = _shares(result)
     result["nis"] = mean_nis(description)
-    known = [row for row in fixes if row["frame"] in true]
-    result |= _errors_and_claims(path, known, true, _alert_limits(run_folder))
-    if (run_folder / "layers.csv").exists():
-        result["layers"] = _layers(run_folder, true)
-    if (folder / "lights_truth.csv").exists():
-        result["identities"] = _identities(run_folder, folder, true)
-    if all((run_folder / name).exists() for name in ("lights.csv", "station.yaml", "camera.yaml")):
-        result["residual_rms_px"] = _residual_rms_px(run_folder, poses)
     return result
 
 
@@ -86,6 +100,7 @@ def _require_same_frames(truth: Path, fixes: list[Row], true: dict[str, Array], 
         raise InputError(f"{truth}: knows none of the run's frames")
     path = truth / "truth.csv" if truth.is_dir() else truth
     true_stamp = {row["frame"]: row.get("t_ns", "") for row in read_rows(path, ("frame",))}
+    true_stamp = with_passes(true_stamp, (row["frame"] for row in known))
     pairs = [(row["t_ns"], true_stamp[row["frame"]]) for row in known]
     t_ns = np.array([pair for pair in pairs if all(map(_STAMP.fullmatch, pair))], np.int64).reshape(-1, 2)
     steps = np.diff(t_ns, axis=0)
@@ -300,6 +315,7 @@ def _identities(run_folder: Path, truth_folder: Path, true: dict[str, Array]) ->
     than 3 px away, as where a reflection or a lit edge beside the lamp was detected.
     """
     lights, path, pixel = _true_lights(truth_folder / "lights_truth.csv"), run_folder / "lights.csv", ("u_px", "v_px")
+    lights = with_passes(lights, true)
     counts = {"identified": 0, "wrong": 0, "displaced": 0}
     for row in read_rows(path, ("frame", "light", *pixel)):
         if not row["light"] or row["frame"] not in true:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from lumidock.errors import InputError
 
@@ -30,6 +30,24 @@ def description_if_any(folder: Path) -> dict[str, Any]:
         return read_description(folder)
     except InputError:
         return {}
+
+
+def frame_in_source(frame: str, known: Container[str]) -> str:
+    """The name of a frame in its source: that of a live run, in a later pass over a recording, has a number before it.
+
+    `2.000017` is frame 000017 in the third pass, unless the source knows a frame of that name.
+    """
+    number, point, name = frame.partition(".")
+    return name if frame not in known and point and number.isdecimal() and name in known else frame
+
+
+_Known = TypeVar("_Known")
+
+
+def with_passes(content: Mapping[str, _Known], frames: Iterable[str]) -> dict[str, _Known]:
+    """What is known of each frame of a source, by the names that a run over one or several passes has for them."""
+    names = {frame: frame_in_source(frame, content) for frame in frames}
+    return {**content, **{frame: content[name] for frame, name in names.items() if name in content}}
 
 
 def source_kind(description: Mapping[str, Any]) -> str:

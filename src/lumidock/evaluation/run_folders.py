@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lumidock.errors import InputError, extra
-from lumidock.evaluation.metrics import evaluate
+from lumidock.evaluation.metrics import count_run, evaluate
 from lumidock.evaluation.run_description import read_description
 from lumidock.streams.run_folder import identities
 from lumidock.streams.source import Source
@@ -20,6 +20,8 @@ _MOST_DEEP = 4  # levels of folders, below the given one, that are searched for 
 def source_of(folder: Path, description: Mapping[str, Any], given: Path | None = None) -> Source | None:
     """The source of a run, by its hashes: the one given, or a sequence folder of its name in or beside the run.
 
+    Or beside the folder that many runs are in.
+
     Raises: InputError for one that is given and that the run was not made from.
     """
     if given is not None:
@@ -28,7 +30,7 @@ def source_of(folder: Path, description: Mapping[str, Any], given: Path | None =
             raise InputError(f"{given}: not what {folder} was made from")
         return opened
     name = Path(str(description.get("source", {}).get("name", ""))).name or "sequence"
-    for place in (folder / name, folder.parent / name):
+    for place in (folder / name, folder.parent / name, folder.parent.parent / name):
         if (place / "timestamps.csv").is_file():
             opened = open_source(place)
             if _is_source(opened, description):
@@ -69,7 +71,8 @@ def _below(folder: Path, deep: int) -> Iterator[Path]:
 def evaluate_all(folder: Path, truth: Path | None = None) -> list[dict[str, Any]]:
     """The evaluation of every run below `folder`, with its `run` (name), `method` and `latency_us`.
 
-    Against `truth`, or the sequence that is found in or beside each run. Raises: InputError for a run without truth.
+    Against `truth`, or the sequence that is found in or beside each run; of several, one without truth is counted only.
+    Raises: InputError for a single run without truth.
     """
     rows = []
     for run in find_runs(folder):
@@ -77,15 +80,16 @@ def evaluate_all(folder: Path, truth: Path | None = None) -> list[dict[str, Any]
         name = str(run.relative_to(folder)) if run != folder else run.resolve().name
         about = {"run": name, "method": description.get("method"), "cold": description.get("cold")}
         latency = {"latency_us": description.get("counts", {}).get("latency_us", {})}
-        rows.append(about | evaluate(run, truth or _truth_beside(run, description)) | latency)
+        known = truth or _truth_beside(run, description)
+        if known is None and run == folder:
+            raise InputError(f"{run}: no truth in or beside it; give TRUTH")
+        rows.append(about | (count_run(run) if known is None else evaluate(run, known)) | latency)
     return rows
 
 
-def _truth_beside(run: Path, description: Mapping[str, Any]) -> Path:
+def _truth_beside(run: Path, description: Mapping[str, Any]) -> Path | None:
     source = source_of(run, description)
-    if source is None or not (source.path / "truth.csv").is_file():
-        raise InputError(f"{run}: no truth in or beside it; give TRUTH")
-    return source.path
+    return source.path if source is not None and (source.path / "truth.csv").is_file() else None
 
 
 def flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

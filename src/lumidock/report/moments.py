@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from lumidock.datatypes import Array, Fix, Frame, Image
+from lumidock.evaluation.run_description import frame_in_source
 from lumidock.picture import developed
 from lumidock.pose import project_lights
 from lumidock.report.page import AnnotatedImage, Mark
@@ -24,7 +25,6 @@ from lumidock.streams.overlay import (
     ring_px,
     shown_detections,
 )
-from lumidock.streams.source import Item
 
 _WIDTH, _QUALITY = 760, 82  # px; of JPEG
 _NEAR_PX = 40.0  # a detection so near to a projected light is described by its distance from it
@@ -48,15 +48,19 @@ def images_of(view: RunView, chosen: list[tuple[int, str]]) -> list[AnnotatedIma
 
 
 def _items(view: RunView, wanted: list[int]) -> Iterator[tuple[int, Frame]]:
-    """The frames that are wanted, by their numbers, in the order of the source."""
+    """The frames that are wanted, by their numbers in the run, in the order of the source."""
     assert view.source is not None
-    items: Iterator[Item] = view.source.items()
-    last = max(wanted, default=-1)
-    for k, item in enumerate(items):
-        if k in wanted and isinstance(item, Frame):
-            yield k, item
-        if k >= last:
+    names = {view.fixes[k].frame: k for k in wanted}
+    left = len(wanted)
+    for item in view.source.items():
+        if not left:
             return
+        name = item.name if isinstance(item, Frame) else item.frame
+        for frame, k in names.items():
+            if name in (frame, frame_in_source(frame, {name})):
+                left -= 1
+                if isinstance(item, Frame):
+                    yield k, item
 
 
 def _moments(view: RunView) -> list[tuple[int, str]]:

@@ -15,7 +15,7 @@ from lumidock.errors import InputError
 from lumidock.evaluation import run_folders
 from lumidock.evaluation.claims import GuideClaims, error_sizes, pose_error, true_guide
 from lumidock.evaluation.metrics import evaluate, read_rows, true_poses
-from lumidock.evaluation.run_description import read_description
+from lumidock.evaluation.run_description import frame_in_source, read_description, with_passes
 from lumidock.station import Station, load_station
 from lumidock.streams.replay import read_fixes
 from lumidock.streams.source import Source
@@ -84,7 +84,7 @@ def load_run(folder: Path, source: Path | None = None) -> RunView:
         raise InputError(f"{folder}: a run without frames")
     fixes = [fix for fix, _, _ in rows]
     opened = run_folders.source_of(folder, description, source)
-    truth = _truth_of(opened)
+    truth = with_passes(_truth_of(opened), (fix.frame for fix in fixes))
     start = next((t for _, t, _ in rows if t is not None), 0)
     guide, guide_levels, guide_limits, guide_errors = _guide_columns(fixes, truth, station.alert_limits)
     position, levels, limits = _pose_columns(fixes, station.alert_limits)
@@ -166,9 +166,12 @@ def _visible(fixes: list[Fix], station: Station, source: Source | None) -> np.nd
     path = source.path / "lights_truth.csv" if source is not None else Path()
     if not path.is_file():
         return None
-    frame, light = {fix.frame: k for k, fix in enumerate(fixes)}, {name: i for i, name in enumerate(station.ids)}
-    visible = np.zeros((len(fixes), len(station.ids)), bool)
+    light, seen = {name: i for i, name in enumerate(station.ids)}, dict[str, list[int]]()
     for row in read_rows(path, ("frame", "light", "visible")):
-        if row["visible"] == "1" and row["frame"] in frame and row["light"] in light:
-            visible[frame[row["frame"]], light[row["light"]]] = True
+        lights = seen.setdefault(row["frame"], [])
+        if row["visible"] == "1" and row["light"] in light:
+            lights.append(light[row["light"]])
+    visible = np.zeros((len(fixes), len(station.ids)), bool)
+    for k, fix in enumerate(fixes):
+        visible[k, seen.get(frame_in_source(fix.frame, seen), [])] = True
     return visible

@@ -15,7 +15,8 @@ from typing import Any
 import cv2
 
 from lumidock.errors import LumidockError
-from lumidock.evaluation.campaign import read_json, source_digest, worker_pool, write_whole
+from lumidock.evaluation.campaign import read_json, source_digest, write_whole
+from lumidock.evaluation.workers import worker_pool
 
 Progress = Callable[[int, int | None], None]
 

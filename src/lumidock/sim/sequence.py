@@ -19,10 +19,11 @@ import cv2
 import numpy as np
 
 from lumidock.camera import Camera, save_camera
-from lumidock.datatypes import Array, Indices
+from lumidock.datatypes import Array, Indices, in_seconds
 from lumidock.errors import InputError, LumidockError
 from lumidock.geometry import quat_xyzw_from_rotation
 from lumidock.sim.aiding import measured
+from lumidock.sim.children import end_children, start_child
 from lumidock.sim.detections import SimulatedFrame, simulated_frames
 from lumidock.sim.draws import Draw
 from lumidock.sim.frames import ExpectedFrame, FrameConditions, FrameRenderer
@@ -169,9 +170,12 @@ def _mapping(workers: int) -> Iterator[Callable[..., Iterable[Any]]]:
         yield map
         return
     spawn = get_context("spawn")  # a fork would inherit the locks of OpenCV's threads
-    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=cv2.setNumThreads, initargs=(1,)) as pool:
+    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=start_child) as pool:
         try:
             yield partial(_mapped, pool)
+        except SystemExit:  # SIGTERM: nobody waits for pictures that are begun
+            end_children()
+            raise
         finally:
             pool.shutdown(cancel_futures=True)
 
@@ -357,13 +361,16 @@ def _detection_truth(frame: SimulatedFrame, station: Station) -> list[Line]:
 
 
 def _write_poses(out: Path, names: list[str], t_ns: Iterable[int], poses: Array) -> None:
-    """Write truth.csv."""
+    """Write truth.csv, and truth.tum with a line for each time at which there is a frame."""
     columns = ("frame", "t_ns", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-    rows = (
-        [name, t, *(f"{value:.9f}" for value in (*T[:3, 3], *quat_xyzw_from_rotation(T[:3, :3])))]
+    rows = [
+        [name, str(t), *(f"{value:.9f}" for value in (*T[:3, 3], *quat_xyzw_from_rotation(T[:3, :3])))]
         for name, t, T in zip(names, t_ns, poses, strict=True)
-    )
+    ]
     _write_csv(out / "truth.csv", columns, rows)
+    at = {int(t): numbers for _, t, *numbers in rows}
+    lines = [" ".join([in_seconds(t), *at[t]]) for t in sorted(at)]
+    (out / "truth.tum").write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 
 
 def _write_lights_truth(out: Path, names: list[str], rows: Iterable[list[Line]]) -> None:

@@ -47,6 +47,14 @@ def infos_for(
     raise InputError(f"{pictures}: no calibration beside it, and {', '.join(infos)} may be another camera's; {_OPTION}")
 
 
+def names_by_pictures(pictures: str) -> tuple[str, ...]:
+    """Where the calibration of pictures may be, by their name alone: beside them only where they are an image topic."""
+    names = tuple(_by_name(pictures))
+    return (
+        names if pictures.rpartition("/")[2].startswith("image") else tuple(n for n in names if n.startswith(pictures))
+    )
+
+
 def _by_name(pictures: str) -> list[str]:
     """The names that image_transport and the drivers use, the surest first."""
     space = _space(pictures)
@@ -57,9 +65,9 @@ def _by_name(pictures: str) -> list[str]:
 
 
 def _shares_its_namespace(pictures: str, others: set[str]) -> bool:
-    """Whether pictures beside these may be another camera's: left and right, not image_raw and image_rect."""
-    forms = [name for name in (pictures, *others) if _space(name) == _space(pictures)]
-    return len(forms) > 1 and not all(name.rpartition("/")[2].startswith("image") for name in forms)
+    """Whether pictures beside these may be another camera's, as left and right; to image_raw its namespace belongs."""
+    beside = any(_space(other) == _space(pictures) for other in others)
+    return beside and not pictures.rpartition("/")[2].startswith("image")
 
 
 def _space(topic: str) -> str:

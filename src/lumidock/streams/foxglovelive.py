@@ -7,7 +7,7 @@ from foxglove import Channel, Schema
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
-from lumidock.streams import ros2
+from lumidock.streams import ros2, rostypes
 from lumidock.streams.vehicle import Vehicle
 
 _BACKLOG = 32  # messages that a client may be behind before the oldest are dropped
@@ -27,15 +27,15 @@ class FoxgloveLive:
             )
         except (RuntimeError, OSError) as error:
             raise OSError(f"{host}:{port}: {error}") from None
-        self._camera, self._vehicle, self._light_ids = camera, vehicle, light_ids
+        self._publication = ros2.Publication(camera, vehicle, light_ids)
         self._channels = {
             topic: Channel(
                 topic,
-                schema=Schema(name=kind, encoding="ros2msg", data=ros2.definition(kind).encode()),
+                schema=Schema(name=kind, encoding="ros2msg", data=rostypes.definition(kind).encode()),
                 message_encoding="cdr",
                 context=self._context,
             )
-            for topic, kind in ros2.TYPES.items()
+            for topic, kind in rostypes.TYPES.items()
         }
 
     @property
@@ -45,12 +45,10 @@ class FoxgloveLive:
 
     def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
         """Send one frame to whoever listens."""
-        if self._vehicle is not None and item.t_ns is not None:
-            self._send(ros2.mounting(self._vehicle, item.t_ns))
-        for message in ros2.messages(item, fix, latency_us, self._camera, self._vehicle, self._light_ids):
+        for message in self._publication.messages(item, fix, latency_us):
             self._send(message)
 
-    def _send(self, message: ros2.Serialized) -> None:
+    def _send(self, message: rostypes.Serialized) -> None:
         self._channels[message.topic].log(message.data, log_time=max(message.t_ns, 0))
 
     def close(self) -> None:

@@ -11,6 +11,8 @@ from functools import partial
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Any
 
+from lumidock.streams.localweb import is_answered
+
 _TIMEOUT_S = 2.0  # a client may take over one request
 _STYLE = "body{font:15px/1.5 monospace;margin:2em;max-width:60em}td{padding:0 1.5em 0 0;vertical-align:top}"
 
@@ -20,7 +22,7 @@ class HealthPage:
 
     def __init__(self, host: str, port: int, health: Callable[[], dict[str, Any]]) -> None:
         """Listen on `host`, `port` (0: any that is free). Raises: OSError when that cannot be."""
-        self._server = _Server((host, port), partial(_Handler, health))
+        self._server = _Server((host, port), partial(_Handler, health, host))
         self._thread = threading.Thread(target=self._server.serve_forever, name="health", daemon=True)
         self._thread.start()
 
@@ -43,8 +45,8 @@ class _Server(HTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "lumidock", ""
 
-    def __init__(self, health: Callable[[], dict[str, Any]], *connection: Any) -> None:  # noqa: ANN401
-        self._health = health
+    def __init__(self, health: Callable[[], dict[str, Any]], host: str, *connection: Any) -> None:  # noqa: ANN401
+        self._health, self._listening = health, host
         # over all of it: one byte a second would keep the next client waiting
         limit = threading.Timer(_TIMEOUT_S, lambda: connection[0].shutdown(socket.SHUT_RDWR))
         limit.daemon = True
@@ -55,6 +57,9 @@ class _Handler(BaseHTTPRequestHandler):
             limit.cancel()
 
     def do_GET(self) -> None:  # the name that http.server calls
+        if not is_answered(self._listening, self.headers.get("Host"), self.headers.get("Origin")):
+            self.send_error(403)
+            return
         health = self._health()
         if self.path == "/health.json":
             self._answer("application/json", json.dumps(health))

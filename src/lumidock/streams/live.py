@@ -14,16 +14,23 @@ from lumidock.errors import FrameError, InputError, extra
 from lumidock.streams.address import SCHEMES, address_of
 from lumidock.streams.clock import now_ns
 from lumidock.streams.images import mono_if_gray, require_size
-from lumidock.streams.source import Item, Size, Source
+from lumidock.streams.source import Item, Network, Reading, Size, Source
 
 _DEVICE = re.compile(r"/dev/video[0-9]{1,3}")
 
 
-def open_live(address: str, *, gray: bool = False) -> Source | None:
-    """A camera by its address: rtsp://..., rtp://HOST:PORT (H.264), /dev/videoN or gige:[NAME]; None for none of these.
+def open_live(
+    address: str, *, gray: bool = False, reading: Reading | None = None, network: Network | None = None
+) -> Source | None:
+    """A camera by its address: rtsp://..., rtp://HOST:PORT (H.264), /dev/videoN, gige:[NAME], or a topic of ROS 2.
 
-    It is not opened yet: a camera that is lost, or not there yet, is an InputError of its `items`.
+    None for none of these. It is not opened yet: a camera that is lost, or not there yet, is an InputError of its
+    `items`; only the calibration beside a topic is waited for.
     """
+    if address.startswith(("zenoh:", "dds:")):
+        with extra("bag"):
+            from lumidock.streams.topics import open_topic
+        return open_topic(address, reading or Reading(), network or Network())
     if address.startswith("gige:"):
         from lumidock.streams import gige
 

@@ -9,7 +9,7 @@ from mcap.writer import CompressionType, Writer
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
-from lumidock.streams import ros2
+from lumidock.streams import ros2, rostypes
 from lumidock.streams.vehicle import Vehicle
 
 _FLUSH_S = 0.2  # what a killed run may lose, and what the next look at the clock takes
@@ -23,19 +23,16 @@ class McapFile:
         self._file = path.open("wb")
         self._writer = Writer(self._file, chunk_size=1 << 20, compression=CompressionType.LZ4)
         self._writer.start("ros2", "lumidock")
-        for kind in set(ros2.TYPES.values()):
-            ros2.definition(kind)  # takes a moment at first use, before there are frames
+        for kind in set(rostypes.TYPES.values()):
+            rostypes.definition(kind)  # takes a moment at first use, before there are frames
         self._writer.flush()
-        self._camera, self._vehicle, self._light_ids = camera, vehicle, light_ids
+        self._publication = ros2.Publication(camera, vehicle, light_ids)
         self._channels: dict[str, int] = {}
-        self._flushed, self._mounted = time.monotonic(), vehicle is None
+        self._flushed = time.monotonic()
 
     def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
         """Append one frame. Raises: OSError when it cannot be written."""
-        if not self._mounted and item.t_ns is not None and self._vehicle is not None:
-            self._write(ros2.mounting(self._vehicle, item.t_ns))
-            self._mounted = True
-        for message in ros2.messages(item, fix, latency_us, self._camera, self._vehicle, self._light_ids):
+        for message in self._publication.messages(item, fix, latency_us):
             self._write(message)
         self.tick()
 
@@ -45,10 +42,10 @@ class McapFile:
             self._writer.flush()
             self._flushed = time.monotonic()
 
-    def _write(self, message: ros2.Serialized) -> None:
+    def _write(self, message: rostypes.Serialized) -> None:
         if message.topic not in self._channels:
-            kind = ros2.TYPES[message.topic]
-            schema = self._writer.register_schema(kind, "ros2msg", ros2.definition(kind).encode())
+            kind = rostypes.TYPES[message.topic]
+            schema = self._writer.register_schema(kind, "ros2msg", rostypes.definition(kind).encode())
             quality = {"offered_qos_profiles": ""}
             self._channels[message.topic] = self._writer.register_channel(message.topic, "cdr", schema, quality)
         t_ns = max(message.t_ns, 0)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import struct
 from collections.abc import Iterator
+from ipaddress import ip_address
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import av
 from av.error import FFmpegError
@@ -78,7 +80,25 @@ def _wall_ns(packet: av.Packet[av.VideoStream]) -> int | None:
 
 def _opened(address: Address) -> av.container.InputContainer:
     if address.scheme == "rtp":
-        sdp = io.BytesIO(_SDP.format(host=address.host, port=address.port or _DEFAULT_PORT).encode())
-        options = _LOW_DELAY | {"protocol_whitelist": "rtp,udp"}
-        return av.open(sdp, "r", format="sdp", options=options, timeout=_TIMEOUT_S)
+        return _listening(address)
     return av.open(address.url, "r", format="rtsp", options=_LOW_DELAY, timeout=_TIMEOUT_S)
+
+
+def _listening(address: Address) -> av.container.InputContainer:
+    """Ports for RTP and RTCP on the address that was given: what senders have to reach, and nobody else.
+
+    FFmpeg listens for RTCP on every interface unless the name of the description ends in a local address.
+    """
+    options = _LOW_DELAY | {"protocol_whitelist": "file,rtp,udp"}
+    where = "" if _is_multicast(address.host) else f"?localaddr={address.host}"
+    with TemporaryDirectory(prefix="lumidock-") as folder:
+        description = Path(folder) / f"stream.sdp{where}"
+        description.write_text(_SDP.format(host=address.host, port=address.port or _DEFAULT_PORT))
+        return av.open(str(description), "r", format="sdp", options=options, timeout=_TIMEOUT_S)
+
+
+def _is_multicast(host: str) -> bool:
+    try:
+        return ip_address(host.strip("[]")).is_multicast
+    except ValueError:
+        return False

@@ -1,4 +1,4 @@
-"""A fix as ROS 2 messages, serialized without ROS: pose, transforms, camera, picture, annotations and status.
+"""A fix as ROS 2 messages: poses and odometry, transforms, status and diagnostics, and what is to be seen of the frame.
 
 Conventions: REP-103 and REP-105; the camera's frame is optical; every stamp is the time of exposure; the covariance is
 row by row in x, y, z and rotations about the fixed axes of the dock; quaternions are x, y, z, w.
@@ -7,255 +7,153 @@ row by row in x, y, z and rotations about the fixed axes of the dock; quaternion
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from lumidock.camera import Camera
-from lumidock.datatypes import Array, Detections, Fix, Frame, Unusable, Velocity
-from lumidock.geometry import quat_xyzw_from_rotation, se3_inverse
-from lumidock.streams.jpeg import jpeg_of
+from lumidock.datatypes import Array, Detections, Fix, Frame, Unusable
+from lumidock.geometry import se3_inverse, skew
+from lumidock.streams import rospicture
+from lumidock.streams.rostypes import (
+    DOCK_POSE,
+    PREFIX,
+    Serialized,
+    header,
+    known,
+    make,
+    pose_of,
+    pose_with_covariance,
+    serialized,
+    transform_of,
+)
 from lumidock.streams.vehicle import Vehicle
+from lumidock.streams.velocity import body_velocity
 
-STATUS_MSG = """\
-# What lumidock says of one frame. Numbers that it does not know are NaN.
-std_msgs/Header header       # time of exposure; frame_id is the dock's
-bool valid                   # the full pose may be used
-bool guide                   # bearing and range may be used
-string status                # none, acquired, tracking, coasting
-string stage                 # search, front, transition, rear
-string reason                # why there is no valid pose; empty when there is
-uint32 n_seen                # detections in the frame
-uint32 n_used                # detections behind the pose
-float64 pl_lateral_m         # what hypot(ex, ey) exceeds once in 1e6 frames
-float64 pl_axial_m           # the same of |ez|
-float64 pl_angle_rad         # the same of the total rotation error
-float64 bearing_x_rad        # atan2(x, z) of the dock's origin in the camera
-float64 bearing_y_rad        # atan2(y, z)
-float64 range_m              # its distance
-float64 pl_bearing_rad       # what the bearing's error exceeds once in 1e6 frames
-float64 pl_range_m           # the same of the range
-float64 latency_s            # from the frame to the fix, decoding excluded
-float64 exposure_factor      # by what exposure times gain should be multiplied; below 1 too bright
-"""
-_DEFINITIONS = {
-    "lumidock_msgs/msg/Status": STATUS_MSG,
-    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
-    "foxglove_msgs/msg/Point2": "float64 x\nfloat64 y\n",
-    "foxglove_msgs/msg/Color": "float64 r\nfloat64 g\nfloat64 b\nfloat64 a\n",
-    "foxglove_msgs/msg/CircleAnnotation": (
-        "builtin_interfaces/Time timestamp\nfoxglove_msgs/Point2 position\nfloat64 diameter\nfloat64 thickness\n"
-        "foxglove_msgs/Color fill_color\nfoxglove_msgs/Color outline_color\n"
-    ),
-    "foxglove_msgs/msg/PointsAnnotation": (
-        "uint8 UNKNOWN=0\nuint8 POINTS=1\nuint8 LINE_LOOP=2\nuint8 LINE_STRIP=3\nuint8 LINE_LIST=4\n"
-        "builtin_interfaces/Time timestamp\nuint8 type\nfoxglove_msgs/Point2[] points\n"
-        "foxglove_msgs/Color outline_color\nfoxglove_msgs/Color[] outline_colors\nfoxglove_msgs/Color fill_color\n"
-        "float64 thickness\n"
-    ),
-    "foxglove_msgs/msg/TextAnnotation": (
-        "builtin_interfaces/Time timestamp\nfoxglove_msgs/Point2 position\nstring text\nfloat64 font_size\n"
-        "foxglove_msgs/Color text_color\nfoxglove_msgs/Color background_color\n"
-    ),
-    "foxglove_msgs/msg/ImageAnnotations": (
-        "foxglove_msgs/CircleAnnotation[] circles\nfoxglove_msgs/PointsAnnotation[] points\n"
-        "foxglove_msgs/TextAnnotation[] texts\n"
-    ),
-}
-PREFIX = "/lumidock"
-TYPES = {
-    f"{PREFIX}/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-    f"{PREFIX}/velocity": "geometry_msgs/msg/TwistWithCovarianceStamped",
-    f"{PREFIX}/status": "lumidock_msgs/msg/Status",
-    "/tf": "tf2_msgs/msg/TFMessage",
-    "/tf_static": "tf2_msgs/msg/TFMessage",
-    f"{PREFIX}/camera_info": "sensor_msgs/msg/CameraInfo",
-    f"{PREFIX}/image/compressed": "sensor_msgs/msg/CompressedImage",
-    f"{PREFIX}/annotations": "foxglove_msgs/msg/ImageAnnotations",
-}
-_NAMED, _SPURIOUS, _CLEAR = (0.3, 1.0, 0.4, 1.0), (1.0, 0.25, 0.25, 1.0), (0.0, 0.0, 0.0, 0.0)
+_SLOWLY_NS = 10**9  # between two diagnostics, and two of the same mounting
+_MEASURED = ("acquired", "tracking")  # fixes that a filter may take; a predicted one holds nothing new
+# of the dock as a robot that drives into it sees it: x into the dock, y left, z up (REP-103)
+_T_DOCK_ENTRY = np.array([[0.0, -1, 0, 0], [0, 0, 1, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+_BROKEN = ("bad_frame", "bad_stamp", "frozen", "calibration", "survey")  # reasons that somebody has to look into
+_OK, _WARN, _ERROR = range(3)  # levels of diagnostic_msgs/DiagnosticStatus
 
 
-@dataclass(frozen=True, slots=True)
-class Serialized:
-    """A message as CDR bytes, with its topic and its stamp."""
+class Publication:
+    """Makes the messages of one frame after the other."""
 
-    topic: str
-    t_ns: int
-    data: bytes
+    def __init__(self, camera: Camera, vehicle: Vehicle | None, light_ids: tuple[str, ...]) -> None:
+        self._camera, self._vehicle, self._light_ids = camera, vehicle, light_ids
+        self._dock, self._cam, self._way = "dock", "camera_optical", "camera_to_dock"
+        if vehicle is not None:
+            self._dock, self._cam, self._way = vehicle.dock_frame, vehicle.camera_frame, vehicle.transform
+        self._slow_ns: int | None = None
 
+    def messages(
+        self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None, *, picture: bool = True
+    ) -> Iterator[Serialized]:
+        """The messages of one frame: a pose and its transform where that is valid, a velocity where it is known."""
+        if item.t_ns is None:
+            return
+        t_ns = item.t_ns
+        yield serialized(f"{PREFIX}/status", t_ns, self._status(fix, t_ns, latency_us))
+        if self._slow_ns is None or abs(t_ns - self._slow_ns) >= _SLOWLY_NS:
+            self._slow_ns = t_ns
+            yield from self._slowly(fix, t_ns)
+        if fix.T_dock_cam is not None:
+            yield from self._pose(fix, fix.T_dock_cam, t_ns)
+        if fix.velocity is not None:
+            covariance = known(fix.velocity.covariance)
+            twist = _twist(fix.velocity.linear_m_s, fix.velocity.angular_rad_s, covariance)
+            stamped = make("geometry_msgs/msg/TwistWithCovarianceStamped", header(t_ns, self._cam), twist)
+            yield serialized(f"{PREFIX}/velocity", t_ns, stamped)
+        if picture and isinstance(item, Frame):
+            if self._camera.port is None:  # CameraInfo has no words for a port
+                yield serialized(f"{PREFIX}/camera_info", t_ns, rospicture.camera_info(self._camera, t_ns, self._cam))
+            yield serialized(f"{PREFIX}/image/compressed", t_ns, rospicture.compressed(item, t_ns, self._cam))
+            yield serialized(f"{PREFIX}/annotations", t_ns, rospicture.rings(fix, t_ns, self._light_ids))
 
-@cache
-def typestore() -> Typestore:
-    """The definitions of ROS 2 and those of lumidock and Foxglove."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in _DEFINITIONS.items():
-        if name not in store.fielddefs:
-            store.register(get_types_from_msg(text, name))
-    return store
+    def _pose(self, fix: Fix, T_dock_cam: Array, t_ns: int) -> Iterator[Serialized]:
+        with_covariance = pose_with_covariance(T_dock_cam, fix.covariance)
+        stamped = make("geometry_msgs/msg/PoseWithCovarianceStamped", header(t_ns, self._dock), with_covariance)
+        yield serialized(f"{PREFIX}/pose", t_ns, stamped)
+        if self._way == "camera_to_dock":
+            yield _transforms("/tf", t_ns, transform_of(self._cam, self._dock, t_ns, se3_inverse(T_dock_cam)))
+        elif self._way == "dock_to_camera":
+            yield _transforms("/tf", t_ns, transform_of(self._dock, self._cam, t_ns, T_dock_cam))
+        if fix.status in _MEASURED:
+            dock = pose_of(se3_inverse(T_dock_cam) @ _T_DOCK_ENTRY)
+            yield serialized(DOCK_POSE, t_ns, make("geometry_msgs/msg/PoseStamped", header(t_ns, self._cam), dock))
+            if self._vehicle is not None:
+                yield from self._body(fix, T_dock_cam, t_ns, self._vehicle)
 
+    def _body(self, fix: Fix, T_dock_cam: Array, t_ns: int, vehicle: Vehicle) -> Iterator[Serialized]:
+        """Pose and motion of the vehicle's body in the dock, as filters of others take them."""
+        T_dock_body = T_dock_cam @ se3_inverse(vehicle.T_body_cam)
+        covariance = None
+        if fix.covariance is not None:
+            J = np.eye(6)
+            J[:3, 3:] = -skew(T_dock_body[:3, 3] - T_dock_cam[:3, 3])  # a rotation error moves what is away from cam
+            covariance = J @ fix.covariance @ J.T
+        where, head = pose_with_covariance(T_dock_body, covariance), header(t_ns, self._dock)
+        yield serialized(f"{PREFIX}/body_pose", t_ns, make("geometry_msgs/msg/PoseWithCovarianceStamped", head, where))
+        odometry = make("nav_msgs/msg/Odometry", head, vehicle.body_frame, where, _twist_of_body(fix, vehicle))
+        yield serialized(f"{PREFIX}/odometry", t_ns, odometry)
 
-def definition(message_type: str) -> str:
-    """The text that stands for a type in an MCAP file."""
-    return str(typestore().generate_msgdef(message_type, ros_version=2)[0])
+    def _slowly(self, fix: Fix, t_ns: int) -> Iterator[Serialized]:
+        """What does not have to come with every frame: diagnostics, and the mounting where nobody else has it."""
+        yield serialized("/diagnostics", t_ns, self._diagnostics(fix, t_ns))
+        vehicle = self._vehicle
+        if vehicle is None or not vehicle.mounting_transform:
+            return
+        if self._way == "dock_to_camera":  # the camera's parent is the dock, so that the body has to hang on the camera
+            T_cam_body = se3_inverse(vehicle.T_body_cam)
+            yield _transforms("/tf_static", t_ns, transform_of(self._cam, vehicle.body_frame, t_ns, T_cam_body))
+        else:
+            mounting = transform_of(vehicle.body_frame, self._cam, t_ns, vehicle.T_body_cam)
+            yield _transforms("/tf_static", t_ns, mounting)
 
+    def _status(self, fix: Fix, t_ns: int, latency_us: int | None) -> Any:  # noqa: ANN401  # classes made at run time
+        levels, guide, nan = fix.protection, fix.guide, float("nan")
+        numbers = (levels.lateral_m, levels.axial_m, levels.angle_rad) if levels else (nan,) * 3
+        bearing = (
+            (guide.bearing_x_rad, guide.bearing_y_rad, guide.range_m, guide.pl_bearing_rad, guide.pl_range_m)
+            if guide
+            else (nan,) * 5
+        )
+        latency_s = nan if latency_us is None else latency_us * 1e-6
+        words = (fix.valid, guide is not None, fix.status, fix.stage, fix.reason, fix.n_seen, fix.n_used)
+        floats = map(float, (*numbers, *bearing))
+        return make(
+            "lumidock_msgs/msg/Status", header(t_ns, self._dock), *words, *floats, latency_s, fix.exposure_factor
+        )
 
-def type_hash(message_type: str) -> str:
-    """RIHS01 hash of a type, which ROS 2 matches types by. Source: REP-2016."""
-    return str(typestore().hash_rihs01(message_type))
-
-
-def messages(
-    item: Frame | Detections | Unusable,
-    fix: Fix,
-    latency_us: int | None,
-    camera: Camera,
-    vehicle: Vehicle | None,
-    light_ids: tuple[str, ...],
-    *,
-    picture: bool = True,
-) -> Iterator[Serialized]:
-    """The messages of one frame: a pose and its transform only where that is valid, a velocity where it is known."""
-    frames = _Frames.of(vehicle)
-    if item.t_ns is None:
-        return
-    t_ns = item.t_ns
-    yield _serialized(f"{PREFIX}/status", t_ns, _status(fix, t_ns, latency_us, frames))
-    if fix.T_dock_cam is not None:
-        yield _serialized(f"{PREFIX}/pose", t_ns, _pose_stamped(fix, t_ns, frames))
-        transform = _transform(frames.dock, frames.camera, t_ns, fix.T_dock_cam)
-        yield _serialized("/tf", t_ns, _make("tf2_msgs/msg/TFMessage", [transform]))
-    if fix.velocity is not None:
-        yield _serialized(f"{PREFIX}/velocity", t_ns, _twist_stamped(fix.velocity, t_ns, frames))
-    if picture and isinstance(item, Frame):
-        if camera.port is None:  # CameraInfo has no words for a port
-            yield _serialized(f"{PREFIX}/camera_info", t_ns, _camera_info(camera, t_ns, frames))
-        yield _serialized(f"{PREFIX}/image/compressed", t_ns, _compressed(item, t_ns, frames))
-        yield _serialized(f"{PREFIX}/annotations", t_ns, _annotations(fix, t_ns, light_ids))
-
-
-def mounting(vehicle: Vehicle, t_ns: int) -> Serialized:
-    """The transform camera -> body, which does not change."""
-    T_cam_body = se3_inverse(vehicle.T_body_cam)
-    transform = _transform(vehicle.camera_frame, vehicle.body_frame, t_ns, T_cam_body)
-    return _serialized("/tf_static", t_ns, _make("tf2_msgs/msg/TFMessage", [transform]))
-
-
-@dataclass(frozen=True, slots=True)
-class _Frames:
-    dock: str
-    camera: str
-
-    @classmethod
-    def of(cls, vehicle: Vehicle | None) -> _Frames:
-        return cls("dock", "camera_optical") if vehicle is None else cls(vehicle.dock_frame, vehicle.camera_frame)
-
-
-def _make(message_type: str, *fields: Any, **named: Any) -> Any:  # noqa: ANN401  # classes made at run time
-    return typestore().types[message_type](*fields, **named)
-
-
-def _serialized(topic: str, t_ns: int, message: Any) -> Serialized:  # noqa: ANN401
-    return Serialized(topic, t_ns, bytes(typestore().serialize_cdr(message, TYPES[topic])))
-
-
-def _time(t_ns: int) -> Any:  # noqa: ANN401
-    return _make("builtin_interfaces/msg/Time", *divmod(max(t_ns, 0), 10**9))  # there is no time before zero
-
-
-def _header(t_ns: int, frame: str) -> Any:  # noqa: ANN401
-    return _make("std_msgs/msg/Header", _time(t_ns), frame)
-
-
-def _status(fix: Fix, t_ns: int, latency_us: int | None, frames: _Frames) -> Any:  # noqa: ANN401
-    levels, guide, nan = fix.protection, fix.guide, float("nan")
-    numbers = (levels.lateral_m, levels.axial_m, levels.angle_rad) if levels else (nan,) * 3
-    bearing = (
-        (guide.bearing_x_rad, guide.bearing_y_rad, guide.range_m, guide.pl_bearing_rad, guide.pl_range_m)
-        if guide
-        else (nan,) * 5
-    )
-    latency_s = nan if latency_us is None else latency_us * 1e-6
-    words = (fix.valid, guide is not None, fix.status, fix.stage, fix.reason, fix.n_seen, fix.n_used)
-    return _make(
-        "lumidock_msgs/msg/Status",
-        _header(t_ns, frames.dock),
-        *words,
-        *map(float, (*numbers, *bearing)),
-        latency_s,
-        fix.exposure_factor,
-    )
+    def _diagnostics(self, fix: Fix, t_ns: int) -> Any:  # noqa: ANN401
+        level, text = _WARN, fix.reason.replace("_", " ")
+        if fix.valid:
+            level, text = _OK, "pose"
+        elif fix.reason in _BROKEN:
+            level = _ERROR
+        elif fix.guide is not None:
+            text = f"bearing and range only: {text}"
+        words = {"status": fix.status, "stage": fix.stage, "reason": fix.reason}
+        words |= {"detections": str(fix.n_seen), "lights used": str(fix.n_used)}
+        values = [make("diagnostic_msgs/msg/KeyValue", key, value) for key, value in words.items()]
+        status = make("diagnostic_msgs/msg/DiagnosticStatus", level, "lumidock: fix", text, "lumidock", values)
+        return make("diagnostic_msgs/msg/DiagnosticArray", header(t_ns, self._dock), [status])
 
 
-def _pose_stamped(fix: Fix, t_ns: int, frames: _Frames) -> Any:  # noqa: ANN401
-    assert fix.T_dock_cam is not None
-    covariance = np.full(36, 0.0) if fix.covariance is None else np.asarray(fix.covariance, float).reshape(36)
-    position = _make("geometry_msgs/msg/Point", *map(float, fix.T_dock_cam[:3, 3]))
-    pose = _make("geometry_msgs/msg/Pose", position, _quaternion(fix.T_dock_cam))
-    with_covariance = _make("geometry_msgs/msg/PoseWithCovariance", pose, covariance)
-    return _make("geometry_msgs/msg/PoseWithCovarianceStamped", _header(t_ns, frames.dock), with_covariance)
+def _transforms(topic: str, t_ns: int, transform: Any) -> Serialized:  # noqa: ANN401
+    return serialized(topic, t_ns, make("tf2_msgs/msg/TFMessage", [transform]))
 
 
-def _twist_stamped(velocity: Velocity, t_ns: int, frames: _Frames) -> Any:  # noqa: ANN401
-    linear, angular = (
-        _make("geometry_msgs/msg/Vector3", *map(float, vector))
-        for vector in (velocity.linear_m_s, velocity.angular_rad_s)
-    )
-    twist = _make("geometry_msgs/msg/Twist", linear, angular)
-    with_covariance = _make("geometry_msgs/msg/TwistWithCovariance", twist, velocity.covariance.reshape(36))
-    return _make("geometry_msgs/msg/TwistWithCovarianceStamped", _header(t_ns, frames.camera), with_covariance)
+def _twist(linear_m_s: Array, angular_rad_s: Array, covariance: Array) -> Any:  # noqa: ANN401
+    vectors = (make("geometry_msgs/msg/Vector3", *map(float, part)) for part in (linear_m_s, angular_rad_s))
+    return make("geometry_msgs/msg/TwistWithCovariance", make("geometry_msgs/msg/Twist", *vectors), covariance)
 
 
-def _quaternion(T: Array) -> Any:  # noqa: ANN401
-    return _make("geometry_msgs/msg/Quaternion", *map(float, quat_xyzw_from_rotation(T[:3, :3])))
-
-
-def _transform(parent: str, child: str, t_ns: int, T_parent_child: Array) -> Any:  # noqa: ANN401
-    translation = _make("geometry_msgs/msg/Vector3", *map(float, T_parent_child[:3, 3]))
-    transform = _make("geometry_msgs/msg/Transform", translation, _quaternion(T_parent_child))
-    return _make("geometry_msgs/msg/TransformStamped", _header(t_ns, parent), child, transform)
-
-
-def _camera_info(camera: Camera, t_ns: int, frames: _Frames) -> Any:  # noqa: ANN401
-    P = np.hstack([camera.K, np.zeros((3, 1))]).reshape(12)
-    roi = _make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
-    matrices = {"d": np.asarray(camera.distortion, float), "k": camera.K.reshape(9), "r": np.eye(3).reshape(9), "p": P}
-    return _make(
-        "sensor_msgs/msg/CameraInfo",
-        header=_header(t_ns, frames.camera),
-        height=camera.height,
-        width=camera.width,
-        distortion_model=camera.model,
-        binning_x=0,
-        binning_y=0,
-        roi=roi,
-        **matrices,
-    )
-
-
-def _compressed(frame: Frame, t_ns: int, frames: _Frames) -> Any:  # noqa: ANN401
-    data = np.frombuffer(jpeg_of(frame), np.uint8)
-    return _make("sensor_msgs/msg/CompressedImage", _header(t_ns, frames.camera), "jpeg", data)
-
-
-def _annotations(fix: Fix, t_ns: int, light_ids: tuple[str, ...]) -> Any:  # noqa: ANN401
-    """A ring around each detection, and the name of its light. Foxglove counts pixels from the corner of the first."""
-    circles, texts, time = [], [], _time(t_ns)
-    green, red, clear = (_make("foxglove_msgs/msg/Color", *rgba) for rgba in (_NAMED, _SPURIOUS, _CLEAR))
-    detections = fix.match.detections if fix.match else Detections.from_uv(fix.frame, t_ns, np.empty((0, 2)))
-    named = fix.match.light if fix.match else np.empty(0, np.int64)
-    for (u, v), radius, light in zip(detections.uv + 0.5, detections.radius_px, named, strict=True):
-        diameter = 2.0 * max(8.0, 1.6 * float(np.nan_to_num(radius)) + 4.0)
-        color = green if light >= 0 else red
-        at = _make("foxglove_msgs/msg/Point2", float(u), float(v))
-        ring = (time, at, diameter, 2.0, clear, color)
-        circles.append(_make("foxglove_msgs/msg/CircleAnnotation", *ring))
-        if light >= 0:
-            beside = _make("foxglove_msgs/msg/Point2", float(u) + diameter / 2.0 + 2.0, float(v))
-            words = (time, beside, light_ids[light], 16.0, color, clear)
-            texts.append(_make("foxglove_msgs/msg/TextAnnotation", *words))
-    return _make("foxglove_msgs/msg/ImageAnnotations", circles, [], texts)
+def _twist_of_body(fix: Fix, vehicle: Vehicle) -> Any:  # noqa: ANN401
+    """Motion in axes of the body; zero with huge variances where it is not known."""
+    velocity = body_velocity(fix, vehicle)
+    if velocity is None:
+        return _twist(np.zeros(3), np.zeros(3), known(None))
+    return _twist(velocity.linear_m_s, velocity.angular_rad_s, known(velocity.covariance))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import Self
 
-from lumidock.datatypes import Array, Fix, Protection, Velocity
+from lumidock.datatypes import Array, Fix, Protection, Velocity, in_seconds
 from lumidock.errors import InputError
 from lumidock.geometry import bearing_and_range, quat_xyzw_from_rotation
 
@@ -92,7 +92,7 @@ class RunFolder:
             ),
         )
         if fix.T_dock_cam is not None:
-            line = " ".join([_seconds(fix.t_ns), *_pose_fields(fix.T_dock_cam)])
+            line = " ".join([in_seconds(fix.t_ns), *_pose_fields(fix.T_dock_cam)])
             self._append("trajectory.tum", f"{line}\n")
 
     def describe(self, content: dict[str, Any]) -> None:
@@ -206,12 +206,6 @@ def _number(value: float) -> str:
 
 def _short(value: float, digits: int = 9) -> str:
     return f"{value:.{digits}g}" if np.isfinite(value) else ""
-
-
-def _seconds(t_ns: int) -> str:
-    """Seconds with nine decimals, exactly."""
-    whole, part = divmod(abs(t_ns), 10**9)
-    return f"{'-' if t_ns < 0 else ''}{whole}.{part:09d}"
 
 
 def identities(files: Mapping[str, Path]) -> dict[str, dict[str, Any]]:

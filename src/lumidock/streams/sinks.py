@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
@@ -13,7 +12,6 @@ from lumidock.errors import InputError, extra
 from lumidock.picture import developed
 from lumidock.station import Station
 from lumidock.streams.overlay import draw, whole
-from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.vehicle import Vehicle
 
 FILE_KINDS = (".mcap", ".rrd", ".mp4")
@@ -59,21 +57,6 @@ def open_rerun(target: str, setting: Setting) -> Sink:
     with extra("rerun"):
         from lumidock.streams.rerunlog import RerunLog
     return RerunLog(target, setting.station, setting.camera)
-
-
-class RunSink:
-    """A run folder as a sink, started once; what could not be written, on a full disk, is missing as whole rows."""
-
-    def __init__(self, folder: Path, light_ids: tuple[str, ...]) -> None:
-        self._folder = RunFolder(folder, light_ids)
-        self._folder.describe({"lumidock": version("lumidock"), "live": True})
-
-    def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
-        """Append one frame."""
-        self._folder.add(fix, latency_us, t_ns=item.t_ns)
-
-    def close(self) -> None:
-        """Nothing is held back, so there is nothing to do."""
 
 
 class Numbered:

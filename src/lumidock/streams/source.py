@@ -35,6 +35,14 @@ class Reading:
 
 
 @dataclass(frozen=True, slots=True)
+class Network:
+    """The domain of ROS, and whether DDS listens on every interface or on this machine only."""
+
+    domain: int = 0
+    everywhere: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Source:
     """An opened source: `items()` iterates over its frames from the start; `count` is how many, if known.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import math
 import time
 
 import zenoh
@@ -10,12 +10,12 @@ from zenoh.ext import Int64, z_serialize
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
-from lumidock.streams import ros2
+from lumidock.streams import ros2, rostypes
 from lumidock.streams.vehicle import Vehicle
+from lumidock.streams.zenohsession import is_connected, nobody_at, open_session, wait_for_router
 
-_NODE = "lumidock"
+_NODE, _LOOK_S = "lumidock", 0.5
 _QOS = "::,10:,:,:,,"  # the defaults of ROS 2: reliable, volatile, the last ten
-_RETRY_MS = 1000
 
 
 class ZenohLink:
@@ -28,48 +28,38 @@ class ZenohLink:
 
         Raises: OSError for an endpoint that is none.
         """
-        config, settings = (
-            zenoh.Config(),
-            {
-                "mode": "peer",
-                "connect/endpoints": [endpoint],
-                "connect/timeout_ms": 0,
-                "connect/exit_on_failure": False,
-                "connect/retry": {"period_init_ms": _RETRY_MS, "period_max_ms": _RETRY_MS},
-                "listen/endpoints": [],
-                "scouting/multicast/enabled": False,
-                "scouting/gossip/enabled": False,
-            },
-        )
-        try:
-            for key, value in settings.items():
-                config.insert_json5(key, json.dumps(value))
-            self._session = zenoh.open(config)
-        except zenoh.ZError:
-            raise OSError(f"{endpoint}: not an endpoint of zenoh, as tcp/127.0.0.1:7447 is one") from None
-        self._camera, self._vehicle, self._light_ids = camera, vehicle, light_ids
+        self._endpoint, self._session = endpoint, open_session(endpoint)
+        self._publication = ros2.Publication(camera, vehicle, light_ids)
         self._id = str(self._session.zid())
         self._gid = bytes.fromhex(self._id.rjust(32, "0"))
         self._publishers, self._sequence = dict[str, zenoh.Publisher](), 0
         liveliness = self._session.liveliness()
         self._tokens = [liveliness.declare_token(f"@ros2_lv/{domain}/{self._id}/0/0/NN/%/%/{_NODE}")]
-        for number, (topic, kind) in enumerate(ros2.TYPES.items(), start=1):
-            name, place = dds_name(kind), topic.replace("/", "%")
-            typed = f"{name}/{ros2.type_hash(kind)}"
+        for number, (topic, kind) in enumerate(rostypes.TYPES.items(), start=1):
+            name, place = rostypes.dds_name(kind), topic.replace("/", "%")
+            typed = f"{name}/{rostypes.type_hash(kind)}"
             self._publishers[topic] = self._session.declare_publisher(
                 f"{domain}/{topic.lstrip('/')}/{typed}", congestion_control=zenoh.CongestionControl.DROP
             )
             token = f"@ros2_lv/{domain}/{self._id}/0/{number}/MP/%/%/{_NODE}/{place}/{typed}/{_QOS}"
             self._tokens.append(liveliness.declare_token(token))
+        wait_for_router(self._session)
+        self.problem, self._looked_s = "", -math.inf  # why nobody receives what is published
+        self.tick()
+
+    def tick(self) -> None:
+        """Look now and then whether there is a router."""
+        if time.monotonic() - self._looked_s >= _LOOK_S:
+            self._looked_s = time.monotonic()
+            connected = is_connected(self._session)
+            self.problem = "" if connected else f"{nobody_at(self._endpoint)}; messages are dropped"
 
     def add(self, item: Frame | Detections | Unusable, fix: Fix, latency_us: int | None) -> None:
         """Publish one frame."""
-        if self._vehicle is not None and item.t_ns is not None:
-            self._put(ros2.mounting(self._vehicle, item.t_ns))
-        for message in ros2.messages(item, fix, latency_us, self._camera, self._vehicle, self._light_ids):
+        for message in self._publication.messages(item, fix, latency_us):
             self._put(message)
 
-    def _put(self, message: ros2.Serialized) -> None:
+    def _put(self, message: rostypes.Serialized) -> None:
         self._sequence += 1
         attachment = z_serialize((Int64(self._sequence), Int64(time.time_ns()), self._gid))
         self._publishers[message.topic].put(message.data, attachment=attachment)
@@ -77,9 +67,3 @@ class ZenohLink:
     def close(self) -> None:
         """Part from the network."""
         self._session.close()
-
-
-def dds_name(message_type: str) -> str:
-    """The name of a type in DDS: geometry_msgs::msg::dds_::Pose_."""
-    package, _, name = message_type.split("/")
-    return f"{package}::msg::dds_::{name}_"

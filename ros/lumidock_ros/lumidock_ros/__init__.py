@@ -1,0 +1,1 @@
+"""lumidock as a ROS 2 node."""
