@@ -17,6 +17,7 @@ import typer
 from lumidock.camera import load_camera
 from lumidock.cli import (
     calibration,
+    console,
     demo,
     designing,
     doctoring,
@@ -84,6 +85,7 @@ _COMMANDS = (
     exporting,
     reporting,
     serving,
+    console,
     calibration,
     water,
     stations,

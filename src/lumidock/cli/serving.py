@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +19,7 @@ from lumidock import methods
 from lumidock.app.serve import STALE_S, Newest, Server, SourceReader, Worker
 from lumidock.app.warm import warm_up
 from lumidock.camera import Camera, save_camera
+from lumidock.cli.console import ConsoleOption, LivePage, live_view, stopped_by_signals, wants_console
 from lumidock.cli.shared import (
     SIM,
     AsJson,
@@ -54,7 +53,6 @@ from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
-from lumidock.streams.healthpage import HealthPage
 from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, open_rerun
 from lumidock.streams.source import Reading, Source
 from lumidock.streams.vehicle import load_vehicle
@@ -127,8 +125,9 @@ def _serve(
     rerun: RerunOption = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write a run folder.")] = None,
     record: RecordOption = None,
-    health_port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="Of the health page.")] = 8780,
+    health_port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="Of console and health.")] = 8780,
     host: HostOption = _LOOPBACK,
+    console: ConsoleOption = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -151,13 +150,15 @@ def _serve(
             *_vehicle_sinks(setting, mavlink, zenoh, domain if dds else None, domain, host),
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
         ]
+        shown = live_view(setting.station, setting.camera) if wants_console(console, host) else None
+        sinks += [Worker("console", lambda: shown, queue=1, patient=True)] if shown is not None else []
         server = _server(opened, _ready_localizer(method, setting, settings), setting.camera, sinks, loop=loop)
-        page = _health_page(host, health_port, server)
-        stack.callback(page.close)
+        live = LivePage(shown, server.health, station_file, method, settings, vehicle)
+        page = stack.enter_context(live.opened(host, health_port))
         # last of all, so that a start that fails leaves what is on the disk alone
         sinks += _file_sinks(setting, station_file, out, record or [], force)
-        print(f"health at http://{host}:{page.port}/", file=sys.stderr if as_json else sys.stdout, flush=True)
-        with _stopped_by_signals(server.stop):
+        print(page, file=sys.stderr if as_json else sys.stdout, flush=True)
+        with stopped_by_signals(server.stop):
             server.serve()
     _print_counts(server, as_json)
     if server.camera.problem and not opened.live:
@@ -188,26 +189,6 @@ def _print_counts(server: Server, as_json: bool) -> None:
         print(json.dumps({word: counts[word] for word in ("frames", "valid", "guide")} | {"dropped": dropped}))
     else:
         print(f"{counts['frames']} frames: {counts['valid']} valid; {dropped} came too fast and were dropped")
-
-
-def _health_page(host: str, port: int, server: Server) -> HealthPage:
-    """The page, listening. Raises: InputError where that cannot be."""
-    try:
-        return HealthPage(host, port, server.health)
-    except OSError as error:
-        raise InputError(f"--health-port {port}: cannot listen on {host}: {error.strerror or error}") from None
-
-
-@contextmanager
-def _stopped_by_signals(stop: threading.Event) -> Iterator[None]:
-    """Let SIGTERM and Ctrl-C end `serve` after the current frame, with every sink closed."""
-    numbers = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
 
 
 def _vehicle_sinks(
