@@ -1,0 +1,207 @@
+// One frame: the picture with its marks, trust and its reason, levels, stage, plans, and when each light was last seen.
+
+import { el, number, svg } from './api.js';
+import { Plans } from './plans.js';
+
+const STAGES = ['search', 'front', 'transition', 'rear'];
+const TRUST = { valid: 'VALID', guide: 'GUIDE ONLY', none: 'NO FIX' };
+const RECENT_S = 0.5; // a light seen so lately is drawn filled
+
+// A disc, a triangle and a cross: the same without colour.
+function trustIcon(trust) {
+  const shape = {
+    valid: [svg('circle', { cx: 16, cy: 16, r: 14, class: 'fill-valid' }),
+      svg('path', { d: 'M9 17l5 5 9-11', fill: 'none', stroke: '#fff', 'stroke-width': 3.5 })],
+    guide: [svg('path', { d: 'M16 2L31 29H1z', class: 'fill-guide' }),
+      svg('path', { d: 'M16 11v9M16 23v3', stroke: '#000', 'stroke-width': 3 })],
+    none: [svg('rect', { x: 2, y: 2, width: 28, height: 28, rx: 3, class: 'fill-none' }),
+      svg('path', { d: 'M9 9l14 14M23 9L9 23', stroke: '#fff', 'stroke-width': 3.5 })],
+  }[trust] ?? [svg('circle', { cx: 16, cy: 16, r: 14, class: 'fill-off' })];
+  return svg('svg', { viewBox: '0 0 32 32', 'aria-hidden': 'true' }, ...shape);
+}
+
+function outline(rank, x, y, r, attributes) {
+  return rank === 0
+    ? svg('circle', { cx: x, cy: y, r, ...attributes })
+    : svg('path', { d: `M${x} ${y - 1.25 * r}L${x + 1.25 * r} ${y}L${x} ${y + 1.25 * r}L${x - 1.25 * r} ${y}z`, ...attributes });
+}
+
+export class FrameView {
+  constructor(about, title = '') {
+    this.about = about;
+    this.rank = new Map(about.lights.map((light) => [light.id, Math.min(1, about.layers.indexOf(light.layer))]));
+    this.canvas = el('canvas', { width: 1, height: 1, role: 'img', 'aria-label': 'picture of the camera' });
+    this.marks = svg('svg', { viewBox: `-0.5 -0.5 ${about.width} ${about.height}`, preserveAspectRatio: 'none' });
+    this.empty = el('p', { class: 'empty' }, 'no picture yet');
+    this.picture = el('div', { class: 'picture' }, this.canvas, this.marks, this.empty);
+    this.picture.style.aspectRatio = `${about.width} / ${about.height}`;
+    this.hint = el('output', { class: 'hint' });
+    this.trust = el('div', { class: 'card trust', 'aria-live': 'polite' });
+    this.numbers = el('dl', { class: 'pairs' });
+    this.levels = el('div');
+    this.stages = el('ol', { class: 'stages', 'aria-label': 'docking stage' });
+    this.lights = el('ul', { class: 'lights' });
+    this.rejected = el('ul');
+    this.rejectedCount = el('summary');
+    this.more = el('dl', { class: 'pairs' });
+    this.moreCard = el('div', { class: 'card', hidden: true }, el('h2', {}, 'Also known'), this.more);
+    this.plans = new Plans(about);
+    this.root = this.#laidOut(title);
+  }
+
+  #laidOut(title) {
+    const bright = el('button', { type: 'button', 'aria-pressed': 'false' }, 'Brighten');
+    bright.addEventListener('click', () => {
+      bright.setAttribute('aria-pressed', String(this.picture.classList.toggle('bright')));
+    });
+    const left = el('div', {},
+      el('div', { class: 'card' },
+        el('div', { class: 'row' }, el('h2', {}, title || 'Camera'), bright),
+        this.picture, this.hint, this.#legend(),
+        el('details', {}, this.rejectedCount, this.rejected)),
+      this.plans.root);
+    const right = el('div', {}, this.trust,
+      el('div', { class: 'card' }, el('h2', {}, 'Levels against alert limits'), this.levels),
+      el('div', { class: 'card' }, el('h2', {}, 'Stage and position'), this.stages, el('p'), this.numbers),
+      el('div', { class: 'card' }, el('h2', {}, 'Lights, and when each was last seen'), this.lights),
+      this.moreCard);
+    return el('section', { class: 'frame' }, left, right);
+  }
+
+  #legend() {
+    const key = (node, text) => el('span', {}, svg('svg', { viewBox: '0 0 20 20', 'aria-hidden': 'true' }, node), text);
+    const [front, rear] = this.about.layers;
+    return el('div', { class: 'legend' },
+      key(outline(0, 10, 10, 7, { class: 'mark front' }), front),
+      rear ? key(outline(1, 10, 10, 6, { class: 'mark rear' }), rear) : null,
+      key(svg('rect', { x: 3, y: 3, width: 14, height: 14, class: 'mark rejected' }), 'rejected'),
+      key(svg('path', { d: 'M10 4v12M4 10h12', class: 'mark predicted' }), 'predicted'));
+  }
+
+  async update(state, jpeg) {
+    await this.#draw(jpeg);
+    this.#mark(state);
+    this.#tell(state);
+    this.#measure(state);
+    this.#list(state);
+    this.plans.update(state);
+  }
+
+  async #draw(jpeg) {
+    this.empty.hidden = Boolean(jpeg);
+    if (!jpeg) {
+      this.canvas.width = this.canvas.height = 1;
+      this.empty.textContent = 'no picture of this frame';
+      return;
+    }
+    const bitmap = await createImageBitmap(jpeg);
+    if (this.canvas.width !== bitmap.width || this.canvas.height !== bitmap.height) {
+      this.canvas.width = bitmap.width;
+      this.canvas.height = bitmap.height;
+    }
+    this.canvas.getContext('2d').drawImage(bitmap, 0, 0);
+    bitmap.close();
+  }
+
+  #mark(state) {
+    const scale = this.about.width / (this.picture.clientWidth || this.about.width); // image pixels per pixel of the page
+    const nodes = [];
+    const open = state.trust !== 'valid' ? ' open' : '';
+    for (const { light, uv } of state.predicted) {
+      const r = 5 * scale;
+      nodes.push(svg('path', { class: `mark predicted${open}`, 'data-light': light,
+        d: `M${uv[0]} ${uv[1] - r}V${uv[1] + r}M${uv[0] - r} ${uv[1]}H${uv[0] + r}` }));
+    }
+    for (const detection of state.detections) nodes.push(...this.#detection(detection, scale));
+    this.marks.replaceChildren(...nodes);
+  }
+
+  #detection(d, scale) {
+    const [x, y] = d.uv;
+    const r = Math.max(9 * scale, 1.6 * (d.radius_px ?? 0) + 4 * scale);
+    const chance = d.p_light === null ? '' : `, probability of a lamp ${d.p_light.toFixed(2)}`;
+    const text = d.light ? `${d.light}: identified${chance}` : `Rejected. ${d.why}`;
+    const told = { tabindex: d.light ? null : '0', 'aria-label': text, role: 'img',
+      onpointerenter: () => { this.hint.textContent = text; }, onfocus: () => { this.hint.textContent = text; },
+      onclick: () => { this.hint.textContent = text; } };
+    if (!d.light) {
+      return [svg('rect', { x: x - r, y: y - r, width: 2 * r, height: 2 * r, class: 'mark rejected', ...told }, svg('title', {}, text))];
+    }
+    const rank = this.rank.get(d.light) ?? 0;
+    const name = svg('text', { x: x + r + 3 * scale, y: y - 4 * scale, class: 'name' }, d.light);
+    name.style.fontSize = `${13 * scale}px`;
+    name.style.strokeWidth = `${3 * scale}px`;
+    return [outline(rank, x, y, r, { class: `mark ${rank ? 'rear' : 'front'}`, ...told }), name];
+  }
+
+  #tell(state) {
+    if (this.told === `${state.trust} ${state.sentence}`) return; // a screen reader should hear of changes alone
+    this.told = `${state.trust} ${state.sentence}`;
+    this.trust.className = `card trust ${state.trust}`;
+    this.trust.replaceChildren(trustIcon(state.trust),
+      el('strong', {}, TRUST[state.trust], state.reason ? el('code', {}, ` ${state.reason}`) : null),
+      el('p', {}, state.sentence),
+      el('p', { class: 'quiet' }, state.remedy ? `Remedy: ${state.remedy}` : ''));
+  }
+
+  #measure(state) {
+    this.levels.replaceChildren(...(state.levels.length ? state.levels.map(level)
+      : [el('p', { class: 'quiet' }, 'None: without a pose or a guide there is nothing to hold against the limits.')]));
+    this.stages.replaceChildren(...STAGES.map((stage) => el('li', { 'aria-current': stage === state.stage ? 'step' : null }, stage)));
+    const rows = [['frame', state.frame], ['status', state.status],
+      ['lights', `${state.n_used} used, ${state.n_seen} detections`]];
+    if (state.pose) {
+      const [x, y, z] = state.pose.position;
+      rows.push(['position', `right ${number(x)}, up ${number(y)}, out ${number(z, 2, 'm')}`]);
+    }
+    if (state.guide) {
+      rows.push(['bearing', `${number(state.guide.bearing_x_deg)}, ${number(state.guide.bearing_y_deg, 2, 'deg')}`],
+        ['range', `${number(state.guide.range_m, 2)} ± ${number(state.guide.pl_range_m, 2, 'm')}`]);
+    }
+    if (state.nis !== null) rows.push(['innovation', `${number(state.nis)} (1 where noise is as stated)`]);
+    if (state.latency_ms !== null) rows.push(['latency', number(state.latency_ms, 1, 'ms')]);
+    for (const [k, one] of state.alternatives.entries()) {
+      const [x, y, z] = one.position;
+      rows.push([`fits ${k + 1}`, `${(100 * one.probability).toFixed(0)} %: ${number(x)}, ${number(y)}, ${number(z, 2, 'm')}; no fix`]);
+    }
+    this.numbers.replaceChildren(...rows.flatMap(([name, value]) => [el('dt', {}, name), el('dd', {}, value)]));
+  }
+
+  #list(state) {
+    const seen = state.last_seen_s ?? {};
+    this.lights.replaceChildren(...this.about.lights.map((light) => {
+      const ago = seen[light.id];
+      const rank = this.rank.get(light.id);
+      const text = ago === undefined ? 'never' : ago < 0.05 ? 'now' : ago < 100 ? `${ago.toFixed(1)} s` : `${Math.round(ago)} s`;
+      return el('li', { class: ago !== undefined && ago < RECENT_S ? 'seen' : '' },
+        svg('svg', { viewBox: '0 0 16 16', 'aria-hidden': 'true' }, outline(rank, 8, 8, 5, { class: `shape ${rank ? 'rear' : 'front'}` })),
+        light.id, el('span', { class: 'quiet' }, text));
+    }));
+    const rejected = state.detections.filter((d) => !d.light);
+    this.rejectedCount.textContent = `${rejected.length} rejected detections`;
+    this.rejected.replaceChildren(...rejected.slice(0, 40).map((d) => el('li', {}, `(${number(d.uv[0], 0)}, ${number(d.uv[1], 0)}) ${d.why}`)));
+    const more = Object.entries(state.more);
+    this.moreCard.hidden = more.length === 0;
+    this.more.replaceChildren(...more.flatMap(([name, value]) => [el('dt', {}, name.replaceAll('_', ' ')), el('dd', {}, said(value))]));
+  }
+}
+
+function said(value) {
+  if (value === null) return '–';
+  if (Array.isArray(value)) return value.map(said).join(', ');
+  if (typeof value === 'object') return Object.entries(value).map(([name, one]) => `${name.replaceAll('_', ' ')} ${said(one)}`).join(', ');
+  return String(value);
+}
+
+// A bar up to the level, with the limit as a line at four fifths of the width.
+function level({ name, level: value, limit, unit }) {
+  const share = value === null || !limit ? 1.25 : Math.min(value / limit, 1.25);
+  const within = value !== null && limit !== null && value < limit;
+  const text = `${number(value, value !== null && value < 0.1 ? 3 : 2)} of ${number(limit, 2, unit)}`;
+  return el('div', { class: 'level' }, el('span', {}, name),
+    svg('svg', { viewBox: '0 0 100 10', preserveAspectRatio: 'none', role: 'img', 'aria-label': `${name} ${text}` },
+      svg('rect', { x: 0.5, y: 1, width: 99, height: 8, class: 'track' }),
+      svg('rect', { x: 0, y: 2, width: 80 * share, height: 6, class: within ? 'fill-valid' : 'fill-none' }),
+      svg('line', { x1: 80, x2: 80, y1: 0, y2: 10, class: 'limit', 'vector-effect': 'non-scaling-stroke' })),
+    el('span', {}, `${text} ${within ? '✓' : '✕'}`));
+}
