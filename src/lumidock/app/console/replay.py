@@ -193,7 +193,7 @@ class Replay:
         """The state of the recording: stamps, trust and events of all variants, and how far it has been read."""
         with self._lock:
             rows = self._variants[0].rows
-            first_ns = next((fix.t_ns for fix, _ in rows if fix.t_ns), 0)
+            first_ns = next((fix.t_ns for fix, _ in rows if fix.reason != "bad_stamp"), 0)
             source = self.recording.source
             return {
                 "count": len(rows),
@@ -202,7 +202,7 @@ class Replay:
                 "ended": self.ended,
                 "problem": self.problem,
                 "frames": [fix.frame for fix, _ in rows],
-                "t_s": [round((fix.t_ns - first_ns) * 1e-9, 4) if fix.t_ns else None for fix, _ in rows],
+                "t_s": [_seconds(fix, first_ns) for fix, _ in rows],
                 "positions": [_position(fix) for fix, _ in rows],
                 "variants": [variant.view() for variant in self._variants.values()],
             }
@@ -312,6 +312,10 @@ class Replay:
         pack(content, folder / "bundle.zip", profile_text(variant.config, variant.label), about)
         del job
         return {"file": str(folder / "bundle.zip")}
+
+
+def _seconds(fix: Fix, first_ns: int) -> float | None:
+    return None if fix.reason == "bad_stamp" else round((fix.t_ns - first_ns) * 1e-9, 4)
 
 
 def _detections(fix: Fix) -> Item:

@@ -26,6 +26,10 @@ function outline(rank, x, y, r, attributes) {
     : svg('path', { d: `M${x} ${y - 1.25 * r}L${x + 1.25 * r} ${y}L${x} ${y + 1.25 * r}L${x - 1.25 * r} ${y}z`, ...attributes });
 }
 
+function ticks(x, y, near, far) {
+  return `M${x} ${y - far}V${y - near}M${x} ${y + near}V${y + far}M${x - far} ${y}H${x - near}M${x + near} ${y}H${x + far}`;
+}
+
 export class FrameView {
   constructor(about, title = '') {
     this.about = about;
@@ -34,6 +38,7 @@ export class FrameView {
     this.marks = svg('svg', { viewBox: `-0.5 -0.5 ${about.width} ${about.height}`, preserveAspectRatio: 'none' });
     this.empty = el('p', { class: 'empty' }, 'no picture yet');
     this.picture = el('div', { class: 'picture' }, this.canvas, this.marks, this.empty);
+    this.zoomed = false;
     this.picture.style.aspectRatio = `${about.width} / ${about.height}`;
     this.hint = el('output', { class: 'hint' });
     this.trust = el('div', { class: 'card trust', 'aria-live': 'polite' });
@@ -45,18 +50,21 @@ export class FrameView {
     this.rejectedCount = el('summary');
     this.more = el('dl', { class: 'pairs' });
     this.moreCard = el('div', { class: 'card', hidden: true }, el('h2', {}, 'Also known'), this.more);
+    this.title = el('h2', {}, title || 'Camera');
     this.plans = new Plans(about);
-    this.root = this.#laidOut(title);
+    this.root = this.#laidOut();
+    new ResizeObserver(() => { if (this.state) this.#mark(this.state); }).observe(this.picture);
   }
 
-  #laidOut(title) {
+  #laidOut() {
     const bright = el('button', { type: 'button', 'aria-pressed': 'false' }, 'Brighten');
     bright.addEventListener('click', () => {
       bright.setAttribute('aria-pressed', String(this.picture.classList.toggle('bright')));
     });
+    this.zoom = el('button', { type: 'button', 'aria-pressed': 'false', onclick: () => this.setZoom(!this.zoomed) }, 'Zoom to lights');
     const left = el('div', {},
       el('div', { class: 'card' },
-        el('div', { class: 'row' }, el('h2', {}, title || 'Camera'), bright),
+        el('div', { class: 'row' }, this.title, bright, this.zoom),
         this.picture, this.hint, this.#legend(),
         el('details', {}, this.rejectedCount, this.rejected)),
       this.plans.root);
@@ -68,6 +76,12 @@ export class FrameView {
     return el('section', { class: 'frame' }, left, right);
   }
 
+  setZoom(zoomed) {
+    this.zoomed = zoomed;
+    this.zoom.setAttribute('aria-pressed', String(zoomed));
+    if (this.state) this.#mark(this.state);
+  }
+
   #legend() {
     const key = (node, text) => el('span', {}, svg('svg', { viewBox: '0 0 20 20', 'aria-hidden': 'true' }, node), text);
     const [front, rear] = this.about.layers;
@@ -75,7 +89,7 @@ export class FrameView {
       key(outline(0, 10, 10, 7, { class: 'mark front' }), front),
       rear ? key(outline(1, 10, 10, 6, { class: 'mark rear' }), rear) : null,
       key(svg('rect', { x: 3, y: 3, width: 14, height: 14, class: 'mark rejected' }), 'rejected'),
-      key(svg('path', { d: 'M10 4v12M4 10h12', class: 'mark predicted' }), 'predicted'));
+      key(svg('path', { d: ticks(10, 10, 3, 8), class: 'mark predicted' }), 'predicted'));
   }
 
   async update(state, jpeg) {
@@ -103,14 +117,36 @@ export class FrameView {
     bitmap.close();
   }
 
+  // Scale and place picture and marks so that the identified lights fill them; returns by how much they are larger.
+  #zoomTo(state) {
+    const uv = state.detections.filter((d) => d.light).map((d) => d.uv);
+    const side = [this.about.width, this.about.height];
+    if (!this.zoomed || !uv.length) {
+      this.canvas.style.transform = 'none';
+      this.marks.setAttribute('viewBox', `-0.5 -0.5 ${side.join(' ')}`);
+      return 1;
+    }
+    const [low, high] = [Math.min, Math.max].map((f) => side.map((_, k) => f(...uv.map((p) => p[k]))));
+    const size = Math.max(...side.map((s, k) => (1.6 * (high[k] - low[k])) / s), 0.08);
+    const times = Math.max(1, 1 / size);
+    const corner = side.map((s, k) => Math.max(0, Math.min(s - s / times, (low[k] + high[k]) / 2 - s / times / 2)));
+    const shift = side.map((s, k) => (-100 * times * corner[k]) / s);
+    this.canvas.style.transform = `translate(${shift[0]}%, ${shift[1]}%) scale(${times})`;
+    this.marks.setAttribute('viewBox', `${corner[0] - 0.5} ${corner[1] - 0.5} ${side[0] / times} ${side[1] / times}`);
+    return times;
+  }
+
   #mark(state) {
-    const scale = this.about.width / (this.picture.clientWidth || this.about.width); // image pixels per pixel of the page
+    this.state = state;
+    const page = this.picture.clientWidth || this.about.width;
+    const scale = this.about.width / page / this.#zoomTo(state); // image pixels per pixel of the page
+    const identified = new Set(state.detections.map((d) => d.light));
     const nodes = [];
     const open = state.trust !== 'valid' ? ' open' : '';
     for (const { light, uv } of state.predicted) {
-      const r = 5 * scale;
+      const [near, far] = identified.has(light) ? [0, 4 * scale] : [6 * scale, 13 * scale]; // a missing one stands out
       nodes.push(svg('path', { class: `mark predicted${open}`, 'data-light': light,
-        d: `M${uv[0]} ${uv[1] - r}V${uv[1] + r}M${uv[0] - r} ${uv[1]}H${uv[0] + r}` }));
+        d: ticks(uv[0], uv[1], near, far) }));
     }
     for (const detection of state.detections) nodes.push(...this.#detection(detection, scale));
     this.marks.replaceChildren(...nodes);
@@ -146,7 +182,7 @@ export class FrameView {
 
   #measure(state) {
     this.levels.replaceChildren(...(state.levels.length ? state.levels.map(level)
-      : [el('p', { class: 'quiet' }, 'None: without a pose or a guide there is nothing to hold against the limits.')]));
+      : [el('p', { class: 'quiet' }, state.trust === 'valid' ? 'None: the method gives a pose without levels.' : 'None: there is neither a pose nor a guide.')]));
     this.stages.replaceChildren(...STAGES.map((stage) => el('li', { 'aria-current': stage === state.stage ? 'step' : null }, stage)));
     const rows = [['frame', state.frame], ['status', state.status],
       ['lights', `${state.n_used} used, ${state.n_seen} detections`]];
@@ -155,7 +191,8 @@ export class FrameView {
       rows.push(['position', `right ${number(x)}, up ${number(y)}, out ${number(z, 2, 'm')}`]);
     }
     if (state.guide) {
-      rows.push(['bearing', `${number(state.guide.bearing_x_deg)}, ${number(state.guide.bearing_y_deg, 2, 'deg')}`],
+      const behind = Math.abs(state.guide.bearing_x_deg) > 90;
+      rows.push(['bearing', behind ? 'the entrance is behind' : `right ${number(state.guide.bearing_x_deg)}, down ${number(state.guide.bearing_y_deg, 2, 'deg')}`],
         ['range', `${number(state.guide.range_m, 2)} ± ${number(state.guide.pl_range_m, 2, 'm')}`]);
     }
     if (state.nis !== null) rows.push(['innovation', `${number(state.nis)} (1 where noise is as stated)`]);

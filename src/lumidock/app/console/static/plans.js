@@ -2,20 +2,21 @@
 
 import { el, svg } from './api.js';
 
-const WIDTH = 400, HEIGHT = 250, MARGIN = 22;
+const WIDTH = 400, HEIGHT = 250, MARGIN = 34;
 
 export class Plans {
   constructor(about) {
     this.about = about;
-    this.trail = [];
+    this.trail = this.all = [];
     this.above = el('div', { class: 'plan card' });
     this.side = el('div', { class: 'plan card' });
     this.root = el('div', { class: 'plans' }, this.above, this.side);
   }
 
-  // Positions (n) of valid fixes, oldest first.
-  setTrail(positions) {
+  // Positions of valid fixes, oldest first, and all positions that the plans have to hold.
+  setTrail(positions, all = positions) {
     this.trail = positions;
+    this.all = all;
   }
 
   update(state) {
@@ -26,7 +27,7 @@ export class Plans {
 
   // Metres shown along z and across it: the dock, the vehicle and the trail, in one scale.
   #view(state) {
-    const points = [...this.about.lights.map((light) => light.p_dock), this.about.docking_point, ...this.trail.slice(-200)];
+    const points = [...this.about.lights.map((light) => light.p_dock), this.about.docking_point, ...this.all];
     if (state.pose) points.push(state.pose.position);
     if (state.guide && !state.pose) points.push([0, 0, state.guide.range_m]);
     const z = points.map((p) => p[2]);
@@ -38,7 +39,7 @@ export class Plans {
 
   #plan(state, view, axis, sign, label) {
     const px = (p) => [MARGIN + (view.high - p[2]) * view.scale, HEIGHT / 2 + sign * p[axis] * view.scale];
-    const nodes = [...this.#grid(view, px), svg('text', { x: 4, y: 12 }, label), svg('text', { x: WIDTH - 30, y: HEIGHT - 5 }, 'z, m')];
+    const nodes = [...this.#grid(view, px), svg('text', { x: 4, y: 12 }, label), svg('text', { x: 4, y: HEIGHT - 5 }, 'z, m')];
     for (const light of this.about.lights) {
       const [x, y] = px(light.p_dock);
       const rank = Math.min(1, this.about.layers.indexOf(light.layer));

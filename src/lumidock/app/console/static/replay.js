@@ -40,9 +40,9 @@ export class Replay {
     return el('div', { class: 'card' },
       this.strips[0].root, this.secondStrip, this.slider,
       el('div', { class: 'row' },
-        button('⏮ loss', 'last loss or alarm (p)', () => this.jump(-1)), button('◀', 'one frame back (left)', () => this.step(-1)),
+        button('« loss', 'last loss or alarm (p)', () => this.jump(-1)), button('◀', 'one frame back (left)', () => this.step(-1)),
         this.playing, button('▶', 'one frame on (right)', () => this.step(1)),
-        button('loss ⏭', 'next loss or alarm (n)', () => this.jump(1)), this.mark, this.place),
+        button('loss »', 'next loss or alarm (n)', () => this.jump(1)), this.mark, this.place),
       this.marks, this.said,
       el('div', { class: 'row' },
         el('label', {}, 'A', this.choices[0]), el('label', {}, 'beside B', this.choices[1]),
@@ -124,7 +124,8 @@ export class Replay {
     this.waiting = !jpeg && !this.data.ended;
     for (const [k, view] of this.views.entries()) {
       if (states[k]) {
-        view.plans.setTrail(k ? [] : this.data.positions.slice(0, index + 1).filter(Boolean));
+        view.title.textContent = `${'AB'[k]}: ${this.#variant(k).label}`;
+        view.plans.setTrail(k ? [] : this.data.positions.slice(0, index + 1).filter(Boolean), this.data.positions.filter(Boolean));
         await view.update(states[k], jpeg);
       }
     }
@@ -142,7 +143,7 @@ export class Replay {
 
   async play() {
     this.running = !this.running;
-    this.playing.textContent = this.running ? '⏸ stop' : '▶ play';
+    this.playing.textContent = this.running ? '■ stop' : '▶ play';
     while (this.running && this.index < this.data.count - 1) {
       const [from, to] = [this.data.t_s[this.index] ?? 0, this.data.t_s[this.index + 1] ?? 0];
       const start = performance.now();
@@ -188,6 +189,7 @@ export class Replay {
     this.places.frames.classList.toggle('two', wanted);
     if (wanted && this.views.length === 1) {
       this.views.push(new FrameView(this.about, 'B'));
+      this.views[1].setZoom(this.views[0].zoomed);
       this.places.frames.append(this.views[1].root);
     } else if (!wanted && this.views.length === 2) {
       this.views.pop().root.remove();

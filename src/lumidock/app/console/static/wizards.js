@@ -160,7 +160,8 @@ export class SurveyWizard {
   }
 
   async #frame(index) {
-    const view = new FrameView(this.about, `Frame ${index + 1}`);
+    const view = new FrameView(this.about);
+    view.setZoom(true);
     const [state, jpeg] = await Promise.all([get(`/api/recording/0/${index}`), getBlob(`/api/picture/${index}`)]);
     const right = el('input', { type: 'checkbox', onchange: () => (right.checked ? this.confirmed.add(index) : this.confirmed.delete(index)) });
     const card = el('div', { class: 'card' }, el('h3', {}, `Frame ${index + 1}`), view.picture, view.hint, el('label', {}, right, 'every light carries its own id'));
