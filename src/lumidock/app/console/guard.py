@@ -122,7 +122,7 @@ class Guard:
 def _without_port(host: str) -> str:
     """The name or address in a Host header; an IPv6 address stands in brackets."""
     if host.startswith("["):
-        return host[1:].partition("]")[0]
+        return host[1:].partition("]")[0] if "]" in host else ""
     return host.partition(":")[0].lower()
 
 

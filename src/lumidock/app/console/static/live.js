@@ -5,6 +5,7 @@ import { FrameView } from './frame.js';
 import { Timeline } from './timeline.js';
 
 const HISTORY = 600; // fixes of the strip and the trail, a minute at ten a second
+const JUMP_M = 2;
 const STALE_MS = 1500;
 const RETRY_MS = 1000;
 
@@ -48,13 +49,19 @@ export class Live {
     this.seen = state.number;
     this.at = performance.now();
     this.trust = (this.trust + state.trust[0]).slice(-HISTORY);
-    if (state.pose) this.trail = [...this.trail, state.pose.position].slice(-HISTORY);
+    if (state.pose) this.#follow(state.pose.position);
     this.view.plans.setTrail(this.trail);
     await this.view.update(state, jpeg);
     this.strip.set({ trust: this.trust, count: Math.max(100, this.trust.length) });
     this.#tellHealth(state.health);
     this.owed = false;
     requestAnimationFrame(() => this.#ask());
+  }
+
+  // The trail of one approach: it begins anew where the vehicle cannot have gone meanwhile.
+  #follow(position) {
+    const last = this.trail.at(-1), jumped = last && Math.hypot(...position.map((x, k) => x - last[k])) > JUMP_M;
+    this.trail = jumped ? [position] : [...this.trail, position].slice(-HISTORY);
   }
 
   // What is on the page may be old: that is said before anyone acts on it.
