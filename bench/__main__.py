@@ -15,6 +15,7 @@ from bench import (
     acquisition,
     association,
     configuration,
+    console_pictures,
     contact_sheet,
     detection,
     detector_constants,
@@ -49,6 +50,7 @@ BENCHES = {
     "reproduced": reproduced,
     "contact-sheet": contact_sheet,
     "configuration": configuration,
+    "console-pictures": console_pictures,
 }
 
 
