@@ -18,7 +18,7 @@ from lumidock.paper import PaperLocalizer
 from lumidock.station import Station
 
 METHODS = ("lumidock", "paper")
-BASELINES = ("hungarian", "plain-pso", "p3p-vote", "p3p-neighbours", "ransac-p3p", "cpd")
+BASELINES = ("hungarian", "plain-pso", "p3p-vote", "p3p-neighbours", "ransac-p3p", "cpd", "learned")
 GROUP = "lumidock.methods"  # of entry points: NAME = "package.module:factory", a factory as in `Factory`
 
 

@@ -118,6 +118,8 @@ def _open_pictures(path: Path, reading: Reading) -> Source:
         sorted((file for file in path.iterdir() if _is_picture(file)), key=in_natural_order)
     )
     if not files:
+        if (path / "truth.csv").exists():
+            raise InputError(f"{path}: a simulation that was interrupted; simulate it anew with `lumidock sim --force`")
         raise InputError(f"{path}: neither timestamps.csv nor any picture ({', '.join(SUFFIXES)}) in it{_hint(path)}")
     notes = list(_rotation_note(files[0], reading))
     if left_out:
