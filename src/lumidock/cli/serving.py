@@ -53,7 +53,7 @@ from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
-from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, open_rerun
+from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, Sink, open_rerun
 from lumidock.streams.source import Reading, Source
 from lumidock.streams.vehicle import load_vehicle
 
@@ -146,23 +146,20 @@ def _serve(
         calibration = calibration_of(camera, opened, name=camera_name, trusted=trust_calibration)
         tell((*opened.notes, *calibration.warnings))
         setting = Setting(load_station(station_file), calibration.camera, mounting)
+        shown = live_view(setting.station, setting.camera) if wants_console(console, host) else None
         sinks = [
             *_vehicle_sinks(setting, mavlink, zenoh, domain if dds else None, domain, host),
-            *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
+            *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host, shown),
         ]
-        shown = live_view(setting.station, setting.camera) if wants_console(console, host) else None
-        sinks += [Worker("console", lambda: shown, queue=1, patient=True)] if shown is not None else []
         server = _server(opened, _ready_localizer(method, setting, settings), setting.camera, sinks, loop=loop)
-        live = LivePage(shown, server.health, station_file, method, settings, vehicle)
-        page = stack.enter_context(live.opened(host, health_port))
+        page = LivePage(shown, server.health, station_file, method, settings, vehicle)
+        line = stack.enter_context(page.opened(host, health_port))
         # last of all, so that a start that fails leaves what is on the disk alone
         sinks += _file_sinks(setting, station_file, out, record or [], force)
-        print(page, file=sys.stderr if as_json else sys.stdout, flush=True)
+        print(line, file=sys.stderr if as_json else sys.stdout, flush=True)
         with stopped_by_signals(server.stop):
             server.serve()
-    _print_counts(server, as_json)
-    if server.camera.problem and not opened.live:
-        raise InputError(server.camera.problem)
+    _tell_end(server, as_json, live=opened.live)
 
 
 def _ready_localizer(name: str, setting: Setting, settings: Config) -> methods.Method:
@@ -182,13 +179,15 @@ def _server(opened: Source, localizer: methods.Method, lens: Camera, sinks: list
     return Server(localizer, reader, newest, sinks, stop)
 
 
-def _print_counts(server: Server, as_json: bool) -> None:
-    """The counts of all that was served, for people or as JSON."""
+def _tell_end(server: Server, as_json: bool, *, live: bool) -> None:
+    """The counts of all that was served, for people or as JSON. Raises: InputError for a recording that broke off."""
     counts, dropped = server.counts, server.newest.dropped
     if as_json:
         print(json.dumps({word: counts[word] for word in ("frames", "valid", "guide")} | {"dropped": dropped}))
     else:
         print(f"{counts['frames']} frames: {counts['valid']} valid; {dropped} came too fast and were dropped")
+    if server.camera.problem and not live:
+        raise InputError(server.camera.problem)
 
 
 def _vehicle_sinks(
@@ -217,8 +216,10 @@ def _vehicle_sinks(
     return workers
 
 
-def _viewer_sinks(setting: Setting, foxglove_port: int | None, rerun: str | None, host: str) -> list[Worker]:
-    workers = []
+def _viewer_sinks(
+    setting: Setting, foxglove_port: int | None, rerun: str | None, host: str, console: Sink | None
+) -> list[Worker]:
+    workers = [] if console is None else [Worker("console", lambda: console, queue=1, patient=True)]
     if foxglove_port is not None:
         with extra("live"), extra("bag"):
             from lumidock.streams.foxglovelive import FoxgloveLive
