@@ -15,6 +15,7 @@ from bench import (
     acquisition,
     association,
     configuration,
+    console,
     console_pictures,
     contact_sheet,
     detection,
@@ -52,6 +53,7 @@ BENCHES = {
     "reproduced": reproduced,
     "contact-sheet": contact_sheet,
     "configuration": configuration,
+    "console": console,
     "console-pictures": console_pictures,
 }
 

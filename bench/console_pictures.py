@@ -68,8 +68,8 @@ def replay(browser: Browser, sequence: Path) -> list[str]:
     """A recording at its side: one frame, two variants beside each other, on a phone, and the settings."""
     with address_of("console", sequence, "--port", 0) as address:
         page = opened(browser, address, _DESKTOP, "light")
-        page.wait_for_function("document.querySelector('.frame canvas').width > 1")
-        page.wait_for_function("fetch('/api/recording').then((a) => a.json()).then((r) => r.ended)")
+        page.locator(".mark.front").first.wait_for()
+        page.get_by_text("reading:").wait_for(state="hidden")
         page.keyboard.press("Shift+ArrowRight")
         page.keyboard.press("Shift+ArrowRight")
         lines = [shoot(page, "replay")]

@@ -1,4 +1,4 @@
-"""Work that takes seconds: lumidock's own commands in processes of their own, at the lowest priority.
+"""Work that takes seconds: lumidock's own commands in processes of their own, at a low priority.
 
 A process of its own takes neither the interpreter from guidance nor, with the kernel's help, the processor.
 """
@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from lumidock.errors import InputError, LumidockError
 
-_NICE = 19
+_NICE = 10  # a tenth of the share of guidance where both want the same core; 19 would starve on a busy computer
 _MOST_KEPT = 50  # jobs whose results can still be asked for
 _MOST_WAITING = 4
 

@@ -216,8 +216,11 @@ class _Api:
         self._console.pages += 1
         try:
             await _answer_all(socket, live, news)
-        except (WebSocketDisconnect, asyncio.TimeoutError, ValueError, RuntimeError):
-            return  # the page went away, stalls, or sent no number
+        except (asyncio.TimeoutError, ValueError):  # it stalls, or sent no number
+            with suppress(RuntimeError):
+                await socket.close(1008)
+        except (WebSocketDisconnect, RuntimeError):  # it went away
+            pass
         finally:
             self._console.pages -= 1
             end()

@@ -49,6 +49,7 @@ export class FrameView {
     this.rejected = el('ul');
     this.rejectedCount = el('summary');
     this.more = el('dl', { class: 'pairs' });
+    this.advice = el('div', { class: 'card advice', hidden: true, 'aria-live': 'polite' });
     this.moreCard = el('div', { class: 'card', hidden: true }, el('h2', {}, 'Also known'), this.more);
     this.title = el('h2', {}, title || 'Camera');
     this.plans = new Plans(about);
@@ -68,7 +69,7 @@ export class FrameView {
         this.picture, this.hint, this.#legend(),
         el('details', {}, this.rejectedCount, this.rejected)),
       this.plans.root);
-    const right = el('div', {}, this.trust,
+    const right = el('div', {}, this.trust, this.advice,
       el('div', { class: 'card' }, el('h2', {}, 'Levels against alert limits'), this.levels),
       el('div', { class: 'card' }, el('h2', {}, 'Stage and position'), this.stages, el('p'), this.numbers),
       el('div', { class: 'card' }, el('h2', {}, 'Lights, and when each was last seen'), this.lights),
@@ -204,6 +205,14 @@ export class FrameView {
     this.numbers.replaceChildren(...rows.flatMap(([name, value]) => [el('dt', {}, name), el('dd', {}, value)]));
   }
 
+  // Go / no-go, where the server knows the size of the vehicle and gives it.
+  #advise(advice) {
+    this.advice.hidden = !advice;
+    if (!advice) return;
+    const { verdict, word } = advice;
+    this.advice.replaceChildren(el('h2', {}, 'Go / no-go'), el('strong', {}, String(verdict).replaceAll('_', ' ').toUpperCase()), word ? ` ${word}` : '');
+  }
+
   #list(state) {
     const seen = state.last_seen_s ?? {};
     this.lights.replaceChildren(...this.about.lights.map((light) => {
@@ -217,7 +226,8 @@ export class FrameView {
     const rejected = state.detections.filter((d) => !d.light);
     this.rejectedCount.textContent = `${rejected.length} rejected detections`;
     this.rejected.replaceChildren(...rejected.slice(0, 40).map((d) => el('li', {}, `(${number(d.uv[0], 0)}, ${number(d.uv[1], 0)}) ${d.why}`)));
-    const more = Object.entries(state.more);
+    this.#advise(state.more.go_no_go);
+    const more = Object.entries(state.more).filter(([name, value]) => name !== 'go_no_go' && value !== null);
     this.moreCard.hidden = more.length === 0;
     this.more.replaceChildren(...more.flatMap(([name, value]) => [el('dt', {}, name.replaceAll('_', ' ')), el('dd', {}, said(value))]));
   }

@@ -5,6 +5,7 @@ import { FrameView } from './frame.js';
 import { Timeline } from './timeline.js';
 
 const HISTORY = 600; // fixes of the strip and the trail, a minute at ten a second
+const HEALTH = ['ok', 'up_s', 'camera', 'fixes', 'sinks'];
 const JUMP_M = 2;
 const STALE_MS = 1500;
 const RETRY_MS = 1000;
@@ -51,6 +52,9 @@ export class Live {
     this.trust = (this.trust + state.trust[0]).slice(-HISTORY);
     if (state.pose) this.#follow(state.pose.position);
     this.view.plans.setTrail(this.trail);
+    for (const [name, value] of Object.entries(state.health)) {
+      if (!HEALTH.includes(name)) state.more[name] = value; // go / no-go, aiding and what else a server tells
+    }
     await this.view.update(state, jpeg);
     this.strip.set({ trust: this.trust, count: Math.max(100, this.trust.length) });
     this.#tellHealth(state.health);
