@@ -13,6 +13,7 @@ from pathlib import Path
 
 from bench import (
     acquisition,
+    aiding,
     association,
     configuration,
     console,
@@ -46,6 +47,7 @@ BENCHES = {
     "detector-constants": detector_constants,
     "lamp-weights": lamp_weights,
     "learned-matcher": learned_matcher,
+    "aiding": aiding,
     "dockings": dockings,
     "docks": docks,
     "visibility": visibility,

@@ -11,7 +11,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from lumidock.camera import Camera
 from lumidock.config import Config
-from lumidock.datatypes import Detections, Fix, Frame
+from lumidock.datatypes import AidingMeasurement, Detections, Fix, Frame
 from lumidock.errors import InputError
 from lumidock.localizer import Localizer
 from lumidock.paper import PaperLocalizer
@@ -36,6 +36,15 @@ class Method(Protocol):
 
     def forget(self) -> None:
         """Begin anew, without history."""
+        ...
+
+
+@runtime_checkable
+class Aided(Protocol):
+    """What a method offers too that makes use of the vehicle's own sensors."""
+
+    def aid(self, measurement: AidingMeasurement) -> None:
+        """One value of one sensor, before the frames that it helps."""
         ...
 
 

@@ -53,6 +53,7 @@ from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
+from lumidock.streams.sensors import AidingFeed
 from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, Sink, open_rerun
 from lumidock.streams.source import Reading, Source
 from lumidock.streams.vehicle import load_vehicle
@@ -176,7 +177,7 @@ def _server(opened: Source, localizer: methods.Method, lens: Camera, sinks: list
     stop, newest = threading.Event(), Newest()
     read = partial(opened.items, (lens.width, lens.height))
     reader = SourceReader(read, newest, live=opened.live, loop=loop, stop=stop)
-    return Server(localizer, reader, newest, sinks, stop)
+    return Server(localizer, reader, newest, sinks, stop, feed=AidingFeed(opened.sensors()))
 
 
 def _tell_end(server: Server, as_json: bool, *, live: bool) -> None:

@@ -28,3 +28,4 @@ class Draw(IntEnum):
     STRUCTURE_GLINTS = 17
     HOT_PIXELS = 20
     JELLYFISH = 21
+    AIDING = 22

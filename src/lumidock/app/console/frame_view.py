@@ -192,7 +192,8 @@ def _more(fix: Fix) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:  # noqa: ANN401  # fields of any type
     if is_dataclass(value) and not isinstance(value, type):
-        return {one.name: _plain(getattr(value, one.name)) for one in fields(value)}
+        found = {one.name: _plain(getattr(value, one.name)) for one in fields(value)}
+        return {name: inner for name, inner in found.items() if inner not in (None, "")}
     if isinstance(value, float | np.floating):
         return _number(value)
     if isinstance(value, np.ndarray):
