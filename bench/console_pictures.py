@@ -9,8 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
-from playwright.sync_api import Browser, Page, sync_playwright
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
 
 _SETTINGS = ("path.start_z_m=12", "path.end_z_m=-1", "path.frame_interval_s=0.3", "faults.missing=1")
 _DESKTOP, _PHONE = (1280, 1180), (390, 1180)
@@ -98,6 +100,8 @@ def live(browser: Browser, sequence: Path) -> list[str]:
 
 def main() -> tuple[dict[str, object], list[str]]:
     """Simulate, open and write them. Raises: SystemExit where there is no Chromium."""
+    from playwright.sync_api import sync_playwright  # here, so that the other benches run without it
+
     chromium = shutil.which("chromium")
     if chromium is None:
         raise SystemExit("console-pictures: needs chromium; Debian has it as a package")

@@ -271,11 +271,19 @@ class Replay:
             path = it.source.path
         else:
             path, options = folder / "sequence", ()
-            write_stretch(self._items(stretch), path)
+            self._write_stretch(stretch, path)
         settings = folder / "config.yaml"
         settings.write_text(profile_text(config, "of a comparison"), encoding="utf-8")
         words = ("--station", it.station, "--camera", it.camera, "--method", method, "--config", settings)
         job.command(["run", str(path), *map(str, words), *options, "--out", str(folder / "run"), "--json"])
+
+    def _write_stretch(self, stretch: tuple[int, int] | None, folder: Path) -> None:
+        """The frames of a stretch as a sequence folder, with what the vehicle's own sensors said."""
+        write_stretch(self._items(stretch), folder)
+        source = self.recording.source
+        sensors = source.path / "aiding.csv" if source is not None else Path()
+        if sensors.is_file():
+            shutil.copyfile(sensors, folder / "aiding.csv")
 
     def _items(self, stretch: tuple[int, int] | None) -> Iterable[Item]:
         """The frames of a stretch, or where they are not at hand their detections."""
@@ -299,7 +307,7 @@ class Replay:
     ) -> dict[str, Any]:
         folder = Path(tempfile.mkdtemp(prefix="bundle-", dir=self._scratch))
         content, it = folder / "content", self.recording
-        write_stretch(self._items(stretch), content / "sequence")
+        self._write_stretch(stretch, content / "sequence")
         shutil.copyfile(it.station, content / "sequence" / "station.yaml")
         save_camera(it.scene.camera, content / "sequence" / "camera.yaml")
         with RunFolder(content / "run", it.scene.station.ids) as rows:
