@@ -47,7 +47,7 @@ export class FrameView {
     this.stages = el('ol', { class: 'stages', 'aria-label': 'docking stage' });
     this.lights = el('ul', { class: 'lights' });
     this.rejected = el('ul');
-    this.rejectedCount = el('summary');
+    this.rejectedCount = el('summary', {}, 'no rejected detections');
     this.more = el('dl', { class: 'pairs' });
     this.advice = el('div', { class: 'card advice', hidden: true, 'aria-live': 'polite' });
     this.moreCard = el('div', { class: 'card', hidden: true }, el('h2', {}, 'Also known'), this.more);
@@ -229,14 +229,19 @@ export class FrameView {
     this.#advise(state.more.go_no_go);
     const more = Object.entries(state.more).filter(([name, value]) => name !== 'go_no_go' && value !== null);
     this.moreCard.hidden = more.length === 0;
-    this.more.replaceChildren(...more.flatMap(([name, value]) => [el('dt', {}, name.replaceAll('_', ' ')), el('dd', {}, said(value))]));
+    this.more.replaceChildren(...more.flatMap(([name, value]) => [el('dt', {}, called(name)), el('dd', {}, said(value))]));
   }
+}
+
+// linear_m_s: linear (m/s)
+function called(name) {
+  return name.replace(/_(m|rad)_s$/, ' ($1/s)').replace(/_(m|rad|deg|s|ms)$/, ' ($1)').replaceAll('_', ' ');
 }
 
 function said(value) {
   if (value === null) return '–';
   if (Array.isArray(value)) return value.map(said).join(', ');
-  if (typeof value === 'object') return Object.entries(value).map(([name, one]) => `${name.replaceAll('_', ' ')} ${said(one)}`).join(', ');
+  if (typeof value === 'object') return Object.entries(value).map(([name, one]) => `${called(name)} ${said(one)}`).join(', ');
   return String(value);
 }
 

@@ -28,7 +28,7 @@ export class Replay {
   }
 
   #controls() {
-    const button = (text, title, run) => el('button', { type: 'button', title, 'aria-label': title, onclick: run }, text);
+    const button = (text, title, run) => el('button', { type: 'button', title, 'aria-label': /[a-z]/.test(text) ? null : title, onclick: run }, text);
     this.slider = el('input', { type: 'range', min: 0, max: 0, value: 0, 'aria-label': 'frame', oninput: () => this.go(Number(this.slider.value)) });
     this.place = el('output');
     this.playing = button('▶ play', 'play or stop (space)', () => this.play());
