@@ -70,10 +70,11 @@ def replay(browser: Browser, sequence: Path) -> list[str]:
     """A recording at its side: one frame, two variants beside each other, on a phone, and the settings."""
     with address_of("console", sequence, "--port", 0) as address:
         page = opened(browser, address, _DESKTOP, "light")
-        page.locator(".mark.front").first.wait_for()
+        page.locator(".picture .mark.front").first.wait_for()
         page.get_by_text("reading:").wait_for(state="hidden")
         page.keyboard.press("Shift+ArrowRight")
         page.keyboard.press("Shift+ArrowRight")
+        page.get_by_text("21 of").wait_for()
         lines = [shoot(page, "replay")]
         page.get_by_role("tab", name="Settings").click()
         page.get_by_label("Least contrast of a light").fill("500")
@@ -82,6 +83,7 @@ def replay(browser: Browser, sequence: Path) -> list[str]:
         page.get_by_text("It is shown as B in Replay").wait_for()
         page.get_by_role("tab", name="Replay").click()
         page.emulate_media(color_scheme="dark")
+        page.get_by_role("button", name="Zoom to lights").first.click()
         lines.append(shoot(page, "compare"))
     return lines
 
@@ -90,11 +92,11 @@ def live(browser: Browser, sequence: Path) -> list[str]:
     """The live view, at a desk and on a phone."""
     with address_of("serve", sequence, "--loop", "--health-port", 0) as address:
         page = opened(browser, address, _DESKTOP, "dark")
-        page.locator(".mark.front").first.wait_for()
+        page.locator(".picture .mark.front").first.wait_for()
         page.get_by_role("button", name="Zoom to lights").click()
         page.wait_for_timeout(4000)  # until there is a trail
         phone = opened(browser, address, _PHONE, "light")
-        phone.locator(".mark.front").first.wait_for()
+        phone.locator(".picture .mark.front").first.wait_for()
         return [shoot(page, "live"), shoot(phone, "phone")]
 
 

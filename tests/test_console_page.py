@@ -109,13 +109,13 @@ def test_the_live_view_can_be_read_everywhere(visit, served, size, scheme):
 def test_the_live_view_shows_the_picture_and_why(visit, served):
     page = visit(served)
     page.get_by_text("VALID", exact=True).wait_for()
-    page.locator(".mark.front").first.wait_for()
+    page.locator(".picture .mark.front").first.wait_for()
     assert page.locator(".level").count() >= 3
     assert page.locator(".lights li.seen").count() >= 4
     assert page.evaluate("document.querySelector('.picture canvas').width") == 320
     page.get_by_role("button", name="Brighten").click()
     page.get_by_role("button", name="Zoom to lights").click()
-    page.locator(".mark.front").first.hover(force=True)
+    page.locator(".picture .mark.front").first.hover(force=True)
     page.get_by_text(re.compile(r"^[A-E]: identified")).wait_for()
     assert page.get_by_role("cell", name="console").is_visible()
 

@@ -41,7 +41,7 @@ export class FrameView {
     this.zoomed = false;
     this.picture.style.aspectRatio = `${about.width} / ${about.height}`;
     this.hint = el('output', { class: 'hint' });
-    this.trust = el('div', { class: 'card trust', 'aria-live': 'polite' });
+    this.trust = el('div', { class: 'card trust', 'aria-live': 'polite' }, trustIcon(''), el('p', {}, 'No frame yet.'));
     this.numbers = el('dl', { class: 'pairs' });
     this.levels = el('div');
     this.stages = el('ol', { class: 'stages', 'aria-label': 'docking stage' });

@@ -18,6 +18,7 @@ export class Timeline {
       this.canvas.addEventListener('pointermove', (event) => { if (event.buttons) at(event); });
     }
     new ResizeObserver(() => this.draw()).observe(this.canvas);
+    matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => this.draw());
   }
 
   set(state) {
