@@ -30,7 +30,7 @@ export class Settings {
     const id = `set-${one.path.replaceAll('.', '-')}`;
     const input = el('input', { id, type: 'text', inputmode: 'decimal', value: String(one.value), autocomplete: 'off' });
     const card = el('div', { class: 'card setting' }, el('label', { for: id }, one.title),
-      el('div', { class: 'row' }, input, el('span', { class: 'quiet' }, `${one.unit}  default ${one.default}`)),
+      el('div', { class: 'row' }, input, el('span', { class: 'quiet' }, `${one.unit ? `${one.unit}, ` : ''}default ${one.default}`)),
       el('p', {}, one.effect), el('details', {}, el('summary', {}, one.path), one.source || 'no comment in the source'));
     input.addEventListener('input', () => this.#changed());
     this.inputs.set(one.path, { input, card, one });
