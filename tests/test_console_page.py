@@ -134,7 +134,7 @@ def test_settings_are_previewed_live_and_saved_as_a_profile(visit, served, tmp_p
     page = visit(served)
     part(page, "Settings")
     page.get_by_label("Least contrast of a light").fill("5000")
-    page.wait_for_timeout(2500)  # in which frames are kept
+    page.get_by_text(re.compile(r"^[1-9]\d* frames are kept")).wait_for()
     page.get_by_role("button", name="Preview on the last seconds").click()
     page.get_by_text(re.compile(r"^0 valid of \d+ frames")).wait_for()
     page.get_by_text(re.compile(r"^[1-9]\d* valid of \d+ frames")).wait_for()

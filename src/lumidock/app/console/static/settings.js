@@ -3,7 +3,7 @@
 import { action, el, ended, get, mayWrite, post, saveAs } from './api.js';
 import { Timeline } from './timeline.js';
 
-const KEEP_MS = 5000;
+const KEEP_MS = 2000;
 
 export class Settings {
   constructor(about, panel, replay) {
@@ -11,6 +11,8 @@ export class Settings {
     this.cards = el('div', { class: 'settings' });
     this.text = el('pre', { tabindex: '0', 'aria-label': 'the profile' });
     this.result = el('div');
+    this.keptSaid = el('p', { class: 'quiet' });
+    this.kept = 0;
     panel.append(
       el('p', {}, replay
         ? 'Change a setting and run a stretch of the recording with it, beside what was recorded. Nothing is written unless you save a profile.'
@@ -66,7 +68,7 @@ export class Settings {
     const reset = el('button', { type: 'button', onclick: () => { for (const { input, one } of this.inputs.values()) input.value = String(one.value); this.#changed(); } }, 'Reset');
     return el('div', { class: 'card' }, el('h2', {}, 'Try'),
       el('div', { class: 'row' }, action(label, line, (tell) => (this.replay ? this.#rerun(tell) : this.#preview(tell)), { 'data-writes': '' }), reset),
-      line, this.result);
+      this.keptSaid, line, this.result);
   }
 
   async #rerun(tell) {
@@ -78,12 +80,17 @@ export class Settings {
   // Called while this panel is open: the server keeps frames for a preview only so long as someone may want one.
   keep() {
     if (this.replay || !mayWrite || this.panel.hidden) return;
-    post('/api/keep').catch(() => {});
+    post('/api/keep').then((kept) => {
+      this.kept = kept.frames;
+      this.keptSaid.textContent = `${kept.frames} frames are kept, ${kept.seconds} s`;
+    }).catch(() => {});
     setTimeout(() => this.keep(), KEEP_MS);
   }
 
   async #preview(tell) {
-    const job = await post('/api/preview', { settings: this.values() });
+    const settings = this.values();
+    if (!this.kept) throw new Error('no frame has been kept yet; wait some seconds');
+    const job = await post('/api/preview', { settings });
     const found = await ended(job, (state) => tell(`${state} …`));
     const strips = [['in_use', 'In use'], ['proposed', 'Proposed']].map(([key, title]) => {
       const strip = new Timeline({ small: true, label: title }), one = found[key], valid = [...one.trust].filter((t) => t === 'v').length;
