@@ -144,7 +144,7 @@ def test_settings_are_previewed_live_and_saved_as_a_profile(visit, served, tmp_p
     page.get_by_text("saved:").wait_for()
     assert "min_snr: 5000" in (tmp_path / "mine.yaml").read_text()
     page.get_by_role("button", name="Reset").click()
-    page.get_by_role("button", name="Load").click()
+    page.get_by_role("button", name="Load", exact=True).click()
     page.get_by_text("nothing is changed until you use it").wait_for()
     assert page.get_by_label("Least contrast of a light").input_value() == "5000"
     page.get_by_label("Least contrast of a light").fill("lots")

@@ -242,7 +242,7 @@ function said(value) {
   if (value === null) return '–';
   if (Array.isArray(value)) return value.map(said).join(', ');
   if (typeof value === 'object') return Object.entries(value).map(([name, one]) => `${called(name)} ${said(one)}`).join(', ');
-  return String(value);
+  return String(typeof value === 'number' ? Number(value.toPrecision(3)) : value);
 }
 
 // A bar up to the level, with the limit as a line at four fifths of the width.
