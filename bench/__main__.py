@@ -28,6 +28,7 @@ from bench import (
     lamp_weights,
     learned_matcher,
     nominal,
+    ports,
     rendering,
     reproduced,
     speed,
@@ -38,6 +39,7 @@ from bench import (
 BENCHES = {
     "acquisition": acquisition,
     "nominal": nominal,
+    "ports": ports,
     "association": association,
     "table1": table1,
     "images": images,
