@@ -20,7 +20,7 @@ from lumidock.app.run import aid, process
 from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import LumidockError
 from lumidock.methods import Method
-from lumidock.streams.sensors import AidingFeed
+from lumidock.streams.sensors import AidingFeed, SensorFeed
 from lumidock.streams.sinks import Sink
 from lumidock.streams.source import Item
 
@@ -259,7 +259,7 @@ class Server:
     arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
     latency_us: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
     last: Fix | None = None
-    feed: AidingFeed = field(default_factory=lambda: AidingFeed(()))
+    feed: SensorFeed = field(default_factory=lambda: AidingFeed(()))
     started_s: float = field(default_factory=time.monotonic)
 
     def serve(self) -> None:

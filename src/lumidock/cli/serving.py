@@ -53,7 +53,7 @@ from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
-from lumidock.streams.sensors import AidingFeed
+from lumidock.streams.sensors import AidingFeed, SensorFeed
 from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, Sink, open_rerun
 from lumidock.streams.source import Reading, Source
 from lumidock.streams.vehicle import load_vehicle
@@ -73,6 +73,12 @@ LiveSource = Annotated[
 MavlinkOption = Annotated[
     str | None,
     typer.Option("--mavlink", metavar="HOST:PORT", help="Send VISION_POSITION_ESTIMATE by UDP; needs --vehicle."),
+]
+SensorsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--sensors", metavar="HOST:PORT", help="Listen there for ATTITUDE and VISION_POSITION_DELTA by UDP, as aiding."
+    ),
 ]
 ZenohOption = Annotated[
     str | None,
@@ -118,6 +124,7 @@ def _serve(
     config: ConfigOption = None,
     loop: Annotated[bool, typer.Option("--loop", help="Show a recording again and again.")] = False,
     mavlink: MavlinkOption = None,
+    sensors: SensorsOption = None,
     zenoh: ZenohOption = None,
     dds: Annotated[bool, typer.Option("--dds", help="Publish to ROS 2 by DDS.")] = False,
     domain: Annotated[int, typer.Option(metavar="N", min=0, max=232, help="ROS_DOMAIN_ID.")] = 0,
@@ -135,24 +142,25 @@ def _serve(
     """Localize live and send every fix to the vehicle, until stopped."""
     require_method(method)
     settings = load_config(config) if config else Config()
-    mounting = load_vehicle(vehicle) if vehicle else None
     with ExitStack() as stack:
         if source.startswith(SIM):
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            source = str(simulated(source, folder / "sequence", station, camera))
+            folder = stack.enter_context(tempfile.TemporaryDirectory())
+            source = str(simulated(source, Path(folder) / "sequence", station, camera))
         reading = Reading(fps, topic, info_topic, bits, as_stored=as_stored, trusted=trust_calibration)
-        reading = replace(reading, follow_calibration=camera is None)
-        opened = open_any(source, reading, delay_ms=delay_ms, station=station)
+        opened = open_any(
+            source, replace(reading, follow_calibration=camera is None), delay_ms=delay_ms, station=station
+        )
         station_file = file_of("station", station, opened.station, opened)
         calibration = calibration_of(camera, opened, name=camera_name, trusted=trust_calibration)
         tell((*opened.notes, *calibration.warnings))
-        setting = Setting(load_station(station_file), calibration.camera, mounting)
+        setting = Setting(load_station(station_file), calibration.camera, load_vehicle(vehicle) if vehicle else None)
         shown = live_view(setting.station, setting.camera) if wants_console(console, host) else None
         sinks = [
             *_vehicle_sinks(setting, mavlink, zenoh, domain if dds else None, domain, host),
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host, shown),
         ]
         server = _server(opened, _ready_localizer(method, setting, settings), setting.camera, sinks, loop=loop)
+        server.feed = _sensor_feed(stack, opened, sensors)
         page = LivePage(shown, server.health, station_file, method, settings, vehicle)
         line = stack.enter_context(page.opened(host, health_port))
         # last of all, so that a start that fails leaves what is on the disk alone
@@ -177,7 +185,7 @@ def _server(opened: Source, localizer: methods.Method, lens: Camera, sinks: list
     stop, newest = threading.Event(), Newest()
     read = partial(opened.items, (lens.width, lens.height))
     reader = SourceReader(read, newest, live=opened.live, loop=loop, stop=stop)
-    return Server(localizer, reader, newest, sinks, stop, feed=AidingFeed(opened.sensors()))
+    return Server(localizer, reader, newest, sinks, stop)
 
 
 def _tell_end(server: Server, as_json: bool, *, live: bool) -> None:
@@ -215,6 +223,21 @@ def _vehicle_sinks(
             from lumidock.streams.ddslink import DdsLink
         workers.append(Worker("dds", partial(DdsLink, dds, host != _LOOPBACK, *shared), queue=_SHORT))
     return workers
+
+
+def _sensor_feed(stack: ExitStack, opened: Source, sensors: str | None) -> SensorFeed:
+    """The sensors of an autopilot, until the stack is closed; else those of a recording."""
+    if sensors is None:
+        return AidingFeed(opened.sensors())
+    with extra("mavlink"):
+        from lumidock.streams.mavlink_sensors import MavlinkSensors
+    host, port = _host_and_port("--sensors", sensors)
+    try:
+        feed = MavlinkSensors(host, port)
+    except OSError as error:
+        raise InputError(f"--sensors {sensors}: {error.strerror or error}") from None
+    stack.callback(feed.close)
+    return feed
 
 
 def _viewer_sinks(
