@@ -147,9 +147,8 @@ def _serve(
             folder = stack.enter_context(tempfile.TemporaryDirectory())
             source = str(simulated(source, Path(folder) / "sequence", station, camera))
         reading = Reading(fps, topic, info_topic, bits, as_stored=as_stored, trusted=trust_calibration)
-        opened = open_any(
-            source, replace(reading, follow_calibration=camera is None), delay_ms=delay_ms, station=station
-        )
+        reading = replace(reading, follow_calibration=camera is None)
+        opened = open_any(source, reading, delay_ms=delay_ms, station=station)
         station_file = file_of("station", station, opened.station, opened)
         calibration = calibration_of(camera, opened, name=camera_name, trusted=trust_calibration)
         tell((*opened.notes, *calibration.warnings))
@@ -163,8 +162,7 @@ def _serve(
         server.feed = _sensor_feed(stack, opened, sensors)
         page = LivePage(shown, server.health, station_file, method, settings, vehicle)
         line = stack.enter_context(page.opened(host, health_port))
-        # last of all, so that a start that fails leaves what is on the disk alone
-        sinks += _file_sinks(setting, station_file, out, record or [], force)
+        sinks += _file_sinks(setting, station_file, out, record or [], force)  # last: a failed start writes nothing
         print(line, file=sys.stderr if as_json else sys.stdout, flush=True)
         with stopped_by_signals(server.stop):
             server.serve()
