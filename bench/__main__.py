@@ -13,8 +13,10 @@ from pathlib import Path
 
 from bench import (
     acquisition,
+    acquisition_time,
     aiding,
     association,
+    bank,
     configuration,
     console,
     console_pictures,
@@ -38,6 +40,8 @@ from bench import (
 
 BENCHES = {
     "acquisition": acquisition,
+    "acquisition-time": acquisition_time,
+    "bank": bank,
     "nominal": nominal,
     "ports": ports,
     "association": association,
