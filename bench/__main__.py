@@ -18,6 +18,8 @@ from bench import (
     association,
     bank,
     configuration,
+    console,
+    console_pictures,
     contact_sheet,
     detection,
     detector_constants,
@@ -61,6 +63,8 @@ BENCHES = {
     "reproduced": reproduced,
     "contact-sheet": contact_sheet,
     "configuration": configuration,
+    "console": console,
+    "console-pictures": console_pictures,
 }
 
 

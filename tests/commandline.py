@@ -27,10 +27,10 @@ def start(*words, **options):
 
 
 def serve(*words):
-    """A server that has begun to serve, and the `url` of its health page."""
+    """A server that has begun to serve, and the `url` of its console or health page, without the token."""
     command = [LUMIDOCK, "serve", *map(str, words), "--health-port", "0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    process.url = process.stdout.readline().split()[-1]
+    process.url = process.stdout.readline().split()[-1].partition("#")[0]
     return process
 
 

@@ -9,7 +9,7 @@ import pytest
 import tomllib
 
 ROOT = Path(__file__).parents[1]
-VEHICLE = ("bag", "video", "mavlink", "zenoh", "live")
+VEHICLE = ("bag", "video", "mavlink", "zenoh", "live", "console")
 PLATFORMS = ("manylinux_2_34_aarch64", "manylinux_2_28_aarch64", "manylinux2014_aarch64")
 PIN = re.compile(r"^([A-Za-z0-9._-]+)==(\S+)(?: ; (.+?))? \\$", re.MULTILINE)
 

@@ -23,12 +23,13 @@ EXTRAS = {
     "zenoh": ("zenoh",),
     "dds": ("cyclonedds",),
     "live": ("foxglove",),
+    "console": ("starlette", "uvicorn", "wsproto"),
     "rerun": ("rerun",),
     "parquet": ("pyarrow",),
     "report": ("matplotlib",),
     "cluster": ("distributed",),
 }
-PORTS = {"health page": 8780, "Foxglove": 8765}
+PORTS = {"console": 8780, "Foxglove": 8765}
 _FIRST_S = 1_700_000_000.0  # no clock that was ever set shows less
 _SYNCHRONIZED = Path("/run/systemd/timesync/synchronized")
 _GIGE_BUFFER = 8 << 20  # bytes; a frame of 5 megapixels comes as a burst

@@ -17,6 +17,7 @@ import typer
 from lumidock.camera import load_camera
 from lumidock.cli import (
     calibration,
+    console,
     demo,
     designing,
     doctoring,
@@ -81,6 +82,7 @@ _COMMANDS = (
     exporting,
     reporting,
     serving,
+    console,
     calibration,
     water,
     stations,

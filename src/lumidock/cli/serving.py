@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import math
 import re
-import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -21,6 +19,7 @@ from lumidock import methods
 from lumidock.app.run import LiveRecord, Record, identity_of
 from lumidock.app.serve import STALE_S, Newest, Server, SourceReader, Worker
 from lumidock.app.warm import warm_up
+from lumidock.cli.console import ConsoleOption, LivePage, live_view, stopped_by_signals, wants_console
 from lumidock.cli.recordings import Recording, RunOptions, open_recording
 from lumidock.cli.shared import (
     SIM,
@@ -51,10 +50,9 @@ from lumidock.cli.shared import (
 )
 from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
-from lumidock.streams.healthpage import HealthPage
 from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.sensors import AidingFeed, SensorFeed
-from lumidock.streams.sinks import FILE_KINDS, Numbered, Setting, open_rerun
+from lumidock.streams.sinks import FILE_KINDS, Numbered, Setting, Sink, open_rerun
 from lumidock.streams.source import Network, Source
 from lumidock.streams.vehicle import load_vehicle
 
@@ -155,8 +153,9 @@ def _serve(
     rerun: RerunOption = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write a run folder.")] = None,
     record: RecordOption = None,
-    health_port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="Of the health page.")] = 8780,
+    health_port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="Of console and health.")] = 8780,
     host: HostOption = _LOOPBACK,
+    console: ConsoleOption = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -173,17 +172,19 @@ def _serve(
         recording = open_recording(source, options, network)
         tell(recording.notes)
         setting = Setting(recording.station, recording.calibration.camera, load_vehicle(vehicle) if vehicle else None)
+        shown = live_view(setting.station, setting.camera) if wants_console(console, host) else None
         sinks = [
             *_mavlink_sinks(setting, mavlink, mavlink_id, mavlink_key, mavlink_heading),
             *_ros_sinks(setting, zenoh, network if dds else None, domain),
-            *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
+            *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host, shown),
         ]
         server = _server(recording, _ready_localizer(setting, recording), sinks, loop=loop)
         server.feed = _sensor_feed(stack, recording.source, sensors)
-        page = stack.enter_context(closing(_health_page(host, health_port, server)))
+        page = LivePage(shown, server.health, recording.station_file, method, recording.config, vehicle)
+        line = stack.enter_context(page.opened(host, health_port))
         # last of all, so that a start that fails leaves what is on the disk alone
         sinks += [*_record_sinks(setting, record or [], force), *_folder_sinks(out, recording, setting, server, force)]
-        print(f"health at http://{host}:{page.port}/", file=sys.stderr if as_json else sys.stdout, flush=True)
+        print(line, file=sys.stderr if as_json else sys.stdout, flush=True)
         _serve_until_stopped(server)
     _print_end(server, as_json, live=recording.source.live)
 
@@ -207,7 +208,7 @@ def _server(recording: Recording, localizer: methods.Method, sinks: list[Worker]
 
 def _serve_until_stopped(server: Server) -> None:
     """Serve, and say which sinks have nobody to send to."""
-    with _stopped_by_signals(server.stop):
+    with stopped_by_signals(server.stop):
         server.serve(lambda: tell(f"{sink.name}: {sink.problem}" for sink in server.workers if sink.problem))
 
 
@@ -220,26 +221,6 @@ def _print_end(server: Server, as_json: bool, *, live: bool) -> None:
         print(f"{counts['frames']} frames: {counts['valid']} valid; {dropped} came too fast and were dropped")
     if server.camera.problem and not live:
         raise InputError(server.camera.problem)
-
-
-def _health_page(host: str, port: int, server: Server) -> HealthPage:
-    """The page, listening. Raises: InputError where that cannot be."""
-    try:
-        return HealthPage(host, port, server.health)
-    except OSError as error:
-        raise InputError(f"--health-port {port}: cannot listen on {host}: {error.strerror or error}") from None
-
-
-@contextmanager
-def _stopped_by_signals(stop: threading.Event) -> Iterator[None]:
-    """Let SIGTERM and Ctrl-C end `serve` after the current frame, with every sink closed."""
-    numbers = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
 
 
 def _mavlink_sinks(
@@ -295,8 +276,10 @@ def _sensor_feed(stack: ExitStack, opened: Source, sensors: str | None) -> Senso
     return feed
 
 
-def _viewer_sinks(setting: Setting, foxglove_port: int | None, rerun: str | None, host: str) -> list[Worker]:
-    workers = []
+def _viewer_sinks(
+    setting: Setting, foxglove_port: int | None, rerun: str | None, host: str, console: Sink | None
+) -> list[Worker]:
+    workers = [] if console is None else [Worker("console", lambda: console, queue=1, patient=True)]
     if foxglove_port is not None:
         with extra("live"), extra("bag"):
             from lumidock.streams.foxglovelive import FoxgloveLive

@@ -1,8 +1,7 @@
-"""The health of a running server as a page and as JSON."""
+"""The health of a running server as JSON, where the console is not installed or not wanted."""
 
 from __future__ import annotations
 
-import html
 import json
 import socket
 import threading
@@ -14,11 +13,10 @@ from typing import Any
 from lumidock.streams.localweb import is_answered
 
 _TIMEOUT_S = 2.0  # a client may take over one request
-_STYLE = "body{font:15px/1.5 monospace;margin:2em;max-width:60em}td{padding:0 1.5em 0 0;vertical-align:top}"
 
 
 class HealthPage:
-    """Answers GET / with a page that renews itself and GET /health.json with JSON, one client after the other."""
+    """Answers GET /health.json, and GET / with the same, one client after the other."""
 
     def __init__(self, host: str, port: int, health: Callable[[], dict[str, Any]]) -> None:
         """Listen on `host`, `port` (0: any that is free). Raises: OSError when that cannot be."""
@@ -60,38 +58,15 @@ class _Handler(BaseHTTPRequestHandler):
         if not is_answered(self._listening, self.headers.get("Host"), self.headers.get("Origin")):
             self.send_error(403)
             return
-        health = self._health()
-        if self.path == "/health.json":
-            self._answer("application/json", json.dumps(health))
-        elif self.path == "/":
-            self._answer("text/html; charset=utf-8", _page(health))
-        else:
+        if self.path not in ("/", "/health.json"):
             self.send_error(404)
-
-    def _answer(self, kind: str, text: str) -> None:
-        data = text.encode()
+            return
+        data = json.dumps(self._health()).encode()
         self.send_response(200)
-        self.send_header("Content-Type", kind)
+        self.send_header("Content-Type", "application/json")
         self.send_header("Content-Length", str(len(data)))
         self.end_headers()
         self.wfile.write(data)
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002, ANN401
         """Keep quiet."""
-
-
-def _page(health: dict[str, Any]) -> str:
-    title = "lumidock: ok" if health["ok"] else "lumidock: NOT ok"
-    head = f"<meta charset=utf-8><meta http-equiv=refresh content=1><title>{title}</title><style>{_STYLE}</style>"
-    return f"<!doctype html>{head}<h1>{title}</h1>{_table(health)}"
-
-
-def _table(content: dict[str, Any]) -> str:
-    rows = (f"<tr><td>{html.escape(str(name))}<td>{_cell(value)}" for name, value in content.items())
-    return f"<table>{''.join(rows)}</table>"
-
-
-def _cell(value: object) -> str:
-    if isinstance(value, dict):
-        return _table(value)
-    return html.escape(f"{value:.3g}" if isinstance(value, float) else str(value))
