@@ -28,3 +28,5 @@ class Draw(IntEnum):
     STRUCTURE_GLINTS = 17
     HOT_PIXELS = 20
     JELLYFISH = 21
+    STATION = 22
+    VEHICLE = 23

@@ -19,6 +19,7 @@ from lumidock.sim.knobs import (
     Counts,
     Daylight,
     Distance,
+    DockingKnobs,
     Interval,
     KnobSection,
     Lamps,
@@ -166,6 +167,7 @@ class Scenario(KnobSection):
     stream: StreamFaults = StreamFaults()
     faults: Faults = Faults()
     detections: DetectionKnobs = DetectionKnobs()
+    docking: DockingKnobs = DockingKnobs()
     config: dict[str, Any] = Field(default_factory=dict)  # configuration of the localizer that the scenario needs
 
     @model_validator(mode="after")

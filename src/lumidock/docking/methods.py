@@ -1,0 +1,54 @@
+"""The methods that can guide a docking: all that there are by name, and `raw`, the default method's poses unproven."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lumidock.camera import Camera
+from lumidock.config import Config
+from lumidock.datatypes import Detections, Fix, Frame
+from lumidock.geometry import se3_inverse
+from lumidock.localizer import Localizer
+from lumidock.methods import Method, localizer_of
+from lumidock.station import Station
+
+RAW = "raw"
+
+
+def docking_method(name: str, station: Station, camera: Camera, config: Config) -> Method:
+    """A method by its name. Raises: InputError for one that there is not."""
+    return RawPoses(station, camera, config) if name == RAW else localizer_of(name, station, camera, config)
+
+
+class RawPoses:
+    """The likeliest pose of the default method in every frame, whether or not it is proven or protected.
+
+    It shows what a vehicle would follow without `valid`: the comparison that protection levels have to win.
+    """
+
+    def __init__(self, station: Station, camera: Camera, config: Config) -> None:
+        self._localizer = Localizer(station, camera, config)
+
+    def process(self, frame: Frame) -> Fix:
+        """Fix of one frame."""
+        return self._unproven(self._localizer.process(frame))
+
+    def process_detections(self, detections: Detections) -> Fix:
+        """Fix of one frame's detections."""
+        return self._unproven(self._localizer.process_detections(detections))
+
+    def forget(self) -> None:
+        """Begin anew, without history."""
+        self._localizer.forget()
+
+    def _unproven(self, fix: Fix) -> Fix:
+        tracks = self._localizer.state.hypotheses
+        if not tracks:
+            return replace(fix, guide=None)
+        T_cam_dock = np.eye(4)
+        T_cam_dock[:3, :3], T_cam_dock[:3, 3] = tracks[0].state.R, tracks[0].state.t
+        return replace(
+            fix, T_dock_cam=se3_inverse(T_cam_dock), reason="", covariance=None, protection=None, guide=None
+        )
