@@ -46,7 +46,7 @@ class Passage:
     gate_m: float = 3.0
     brake_m_s2: float = 0.1
     entry_m_s: float = 0.5
-    blind_s: float = 6.0
+    blind_s: float = 10.0
 
     @property
     def clearance_m(self) -> float:

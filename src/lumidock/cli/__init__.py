@@ -19,6 +19,7 @@ from lumidock.cli import (
     calibration,
     demo,
     designing,
+    docking,
     doctoring,
     evaluation,
     exporting,
@@ -64,6 +65,7 @@ from lumidock.cli.shared import (
     prepare_sequence,
     progress_bar,
     require_folder,
+    seeds_of,
     shipped_or_path,
     simulated,
     tell,
@@ -77,7 +79,6 @@ from lumidock.methods import METHODS, localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.source import Item, Reading
 
-_MAX_SEED = 10**9
 _COMMANDS = (
     evaluation,
     inspection,
@@ -89,6 +90,7 @@ _COMMANDS = (
     stations,
     setting_up,
     designing,
+    docking,
     demo,
     doctoring,
 )  # importing them adds their commands
@@ -333,7 +335,7 @@ def _campaign(
     campaign = plan(
         [load_scenario(name, tuple(settings or ())) for name in scenarios],
         methods or METHODS[:1],
-        _seeds(seeds),
+        seeds_of(seeds),
         shipped_or_path("station", station) if station else None,
         shipped_or_path("camera", camera or DEFAULT_CAMERA),
         cold=cold,
@@ -351,14 +353,6 @@ def _campaign(
     print(markdown(table))
     ran = f"{speed:.0f} frames a second and core" if speed > 0.0 else "nothing was left to do"
     print(f"{ran}; written to {out}")
-
-
-def _seeds(text: str) -> tuple[int, int]:
-    """The two ends of A:B. Raises: InputError when they hold no seed."""
-    first, _, stop = text.partition(":")
-    if not (first.isdecimal() and stop.isdecimal() and int(first) < int(stop) <= _MAX_SEED):
-        raise InputError(f"--seeds {text}: wanted A:B, whole numbers, A below B")
-    return int(first), int(stop)
 
 
 @app.command("warm", epilog=example("lumidock warm"))

@@ -1,8 +1,8 @@
-"""From a wanted velocity and heading to thrust: speed loops with the drag fed forward, gains from the vehicle alone.
+"""From a wanted velocity and heading to thrust: speed loops with drag and turning forces fed forward, gains from the vehicle alone.
 
 The speed loop has a quarter of the bandwidth of the thrusters, the loop of position or heading around it a quarter of
 that: each is then critically damped (a cascade of first-order lags 1/T and gain 1/(4 T) has a double pole at -1/(2 T)).
-Its integral carries what the model does not know, the current above all, with a quarter of the square of its gain.
+Its integral carries what the model does not know, with a quarter of the square of its gain.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 from lumidock.docking.instruments import Reading
-from lumidock.docking.vehicle import Four, Three, VehicleModel, body_drag
+from lumidock.docking.vehicle import Four, Three, VehicleModel, body_drag, coriolis_of
 
 _CURRENT_MEMORY_S = 3.0  # over which the estimate of the current is smoothed: that of turbulence
 
@@ -50,19 +50,24 @@ class Controller:
         x, y, z = wanted.velocity
         turn = self.position_gain * math.remainder(wanted.heading_rad - heading_rad, 2.0 * math.pi)
         targets = (c * x + s * y, -s * x + c * y, z, turn)
+        fx, fy, fz = (want - flow for want, flow in zip(wanted.velocity, self.current, strict=True))
+        through = (c * fx + s * fy, -s * fx + c * fy, fz, turn)
         measured = (*reading.over_ground, reading.yaw_rate)
+        water = (c * self.current[0] + s * self.current[1], -s * self.current[0] + c * self.current[1])
+        flow = (measured[0] - water[0], measured[1] - water[1], 0.0, measured[3])
+        coriolis = coriolis_of(self.model, flow)
         forces, sums = [], []
         for axis in range(4):
             miss = targets[axis] - measured[axis]
             inertia, most = self.model.inertia[axis], self.model.thrust[axis]
-            push = inertia * self.speed_gain * miss + body_drag(self.model, axis, targets[axis])
+            push = inertia * self.speed_gain * miss + body_drag(self.model, axis, through[axis]) - coriolis[axis]
             total = push + self.integral[axis]
             grows = 0.25 * inertia * self.speed_gain**2 * miss * dt_s
             saturated = abs(total) > most and total * miss > 0.0
             sums.append(self.integral[axis] + (0.0 if saturated else grows))
             forces.append(max(-most, min(most, total)))
         self.integral = (sums[0], sums[1], sums[2], sums[3])
-        self.thrust = (forces[0], forces[1], forces[2], forces[3])
+        self.thrust = self.model.within_limits((forces[0], forces[1], forces[2], forces[3]))
         self._estimate_current(reading, heading_rad, dt_s)
         return self.thrust
 

@@ -13,7 +13,7 @@ _DVL_SCALE, _DVL_BIAS_M_S, _DVL_NOISE_M_S = 0.01, 0.003, 0.01  # 1 sigma. Source
 _GYRO_BIAS_RAD_S, _GYRO_NOISE_RAD_S = math.radians(0.05), math.radians(0.1)  # industrial MEMS, bias in run
 HEADING_SIGMA_RAD, TILT_SIGMA_RAD = math.radians(2.0), math.radians(0.3)  # compass beside steel; inclinometers
 HOMING_SIGMA_M = 1.0  # of each axis at 20 m: ultra-short baseline of 3 degrees
-DVL_SIGMA_M_S = 0.01  # what the guidance reckons with: bias, scale at 0.5 m/s and noise over a second
+DVL_SIGMA_M_S = 0.006  # what the guidance reckons with: the bias, and the scale at 0.5 m/s
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,18 +24,23 @@ from lumidock.go_no_go import Advice, Passage
 from lumidock.methods import Method
 from lumidock.sim.draws import Draw
 from lumidock.sim.point_camera import PointCamera, point_camera
+from lumidock.sim.rendered_camera import RenderedCamera
 from lumidock.sim.scenario import Scenario
 from lumidock.station import Station
 from lumidock.yamlfile import validate
 
 Outcome = Literal["docked", "aborted", "out_of_time"]
 _CONTROL_S = 0.05  # between two steps of the control: 20 Hz, a quarter of the thrusters' lag
+_NEAR_M = 1.0  # before the entrance the hull, behind the camera, cannot touch the frame yet
 _POSE_LIGHTS = 4  # with fewer no pose can be had
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Docking:
-    """What one docking needs: where, with what, by which method, and the seed of all its draws."""
+    """What one docking needs: where, with what, by which method, and the seed of all its draws.
+
+    `rendered`: the method is given pictures, not detections; slower by far.
+    """
 
     scenario: Scenario
     station: Station
@@ -43,6 +48,7 @@ class Docking:
     vehicle: VehicleModel
     method: str
     seed: int
+    rendered: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,11 +119,6 @@ class World:
     frame: Frame
     room_m: float = math.inf
 
-    @property
-    def pitch_roll(self) -> Callable[[float], tuple[float, float]]:
-        """Pitch and roll at a time, rad."""
-        return self.rocking.at
-
     def pose(self, t_s: float) -> Array:
         """True pose of cam in dock (4, 4)."""
         pitch, roll = self.rocking.at(t_s)
@@ -177,24 +178,49 @@ def run(docking: Docking) -> tuple[Verdict, list[Moment]]:
     """One docking from the start to its end. Raises: InputError for a scenario that cannot be a closed loop."""
     interval_s = docking.scenario.path.frame_interval_s
     frames = int(docking.scenario.docking.time_limit_s / interval_s)
-    eye = point_camera(docking.scenario, docking.station, docking.camera, docking.seed, frames)
     world = start(docking)
     pilot = aboard(docking, world)
+    eye = camera_of(docking, docking.camera, frames)
+    look = _looker(docking, pilot.method, eye)
     for number in range(frames):
-        if _frame(number, docking, world, pilot, eye):
+        if _frame(number, docking, world, pilot, look if number in eye.rows else None):
             break
         _sail(world, pilot, number * interval_s, interval_s)
     return _verdict(docking, world, pilot), pilot.moments
 
 
-def _frame(number: int, docking: Docking, world: World, pilot: Pilot, eye: PointCamera) -> bool:
+def camera_of(docking: Docking, camera: Camera, frames: int) -> PointCamera:
+    """The camera of a docking of at most so many frames, with its lens or one like it."""
+    return point_camera(docking.scenario, docking.station, camera, docking.seed, frames)
+
+
+Look = Callable[[int, Array], tuple[Fix, int]]
+
+
+def _looker(docking: Docking, method: Method, eye: PointCamera) -> Look:
+    """What turns a frame's number and true pose into the method's fix, and the number of lights that were seen."""
+    if not docking.rendered:
+
+        def look(number: int, T_dock_cam: Array) -> tuple[Fix, int]:
+            seen = eye.see(number, T_dock_cam)
+            return method.process_detections(seen.detections), int((seen.light >= 0).sum())
+
+        return look
+    rendered = RenderedCamera(eye, docking.seed)
+
+    def look_at_picture(number: int, T_dock_cam: Array) -> tuple[Fix, int]:
+        fix = method.process(rendered.see(number, T_dock_cam))
+        return fix, fix.n_used
+
+    return look_at_picture
+
+
+def _frame(number: int, docking: Docking, world: World, pilot: Pilot, look: Look | None) -> bool:
     """Look, localize, decide; True when the docking is over."""
     t_s = number * docking.scenario.path.frame_interval_s
     T_dock_cam, fix, lights, error_m = world.pose(t_s), None, 0, math.nan
-    if number in eye.rows:
-        seen = eye.see(number, T_dock_cam)
-        lights = int((seen.light >= 0).sum())
-        fix = pilot.method.process_detections(seen.detections)
+    if look is not None:
+        fix, lights = look(number, T_dock_cam)
         pilot.navigator.take(fix)
         if fix.T_dock_cam is not None:
             error_m = float(np.linalg.norm(fix.T_dock_cam[:3, 3] - T_dock_cam[:3, 3]))
@@ -208,7 +234,7 @@ def _frame(number: int, docking: Docking, world: World, pilot: Pilot, eye: Point
         step=pilot.wanted_step,
         fix=fix,
         lights_seen=lights,
-        room_m=world.measure_room(),
+        room_m=world.measure_room() if T_dock_cam[2, 3] < _NEAR_M else math.inf,
         error_m=error_m,
     )
     pilot.moments.append(moment)

@@ -11,10 +11,16 @@ from lumidock.config import Config
 from lumidock.datatypes import Detections, Fix, Frame
 from lumidock.geometry import se3_inverse
 from lumidock.localizer import Localizer
-from lumidock.methods import Method, localizer_of
+from lumidock.methods import Method, localizer_of, require_method
 from lumidock.station import Station
 
 RAW = "raw"
+
+
+def require_docking_method(name: str) -> None:
+    """Raises: InputError for a method that there is not."""
+    if name != RAW:
+        require_method(name)
 
 
 def docking_method(name: str, station: Station, camera: Camera, config: Config) -> Method:

@@ -1,7 +1,7 @@
 """Where the vehicle takes itself to be: by the last usable fix, and reckoned with its own instruments since then.
 
-A valid pose replaces all that was known. A guide (bearing and range) gives a position with the vehicle's own attitude,
-and replaces what is known where its level is smaller. Between fixes velocity over ground and yaw rate are integrated,
+A valid pose replaces what was known, unless that has smaller levels and agrees. A guide (bearing and range) gives a
+position with the vehicle's own attitude, and replaces what is known where its level is smaller. Between fixes velocity over ground and yaw rate are integrated,
 and the levels grow by what these may be wrong. Positions are those of the camera, in `approach`.
 """
 
@@ -71,14 +71,16 @@ class Navigator:
             self._take_guide(fix)
 
     def _take_pose(self, fix: Fix, T_dock_cam: Array) -> None:
+        self.since_fix_s = self.since_guide_s = 0.0
+        level_m, level_z_m = (fix.protection.lateral_m, fix.protection.axial_m) if fix.protection else (0.0, 0.0)
         x, y, z = (float(value) for value in R_DOCK_APPROACH.T @ T_dock_cam[:3, 3])
+        apart_m = math.hypot(y - self.position[1], z - self.position[2])
+        if level_m > self.level_m and level_z_m > self.level_z_m and apart_m < level_m:
+            return  # what an earlier pose and the own instruments say is better known, and agrees
         ahead = R_DOCK_APPROACH.T @ T_dock_cam[:3, :3] @ R_BODY_CAM_AHEAD.T[:, 0]
         self.position, self.heading_rad = (x, y, z), math.atan2(float(ahead[1]), float(ahead[0]))
         self.heading_sigma_rad = _YAW_KNOWN_RAD
-        self.level_m, self.level_z_m = (
-            (fix.protection.lateral_m, fix.protection.axial_m) if fix.protection else (0.0, 0.0)
-        )
-        self.since_fix_s = self.since_guide_s = 0.0
+        self.level_m, self.level_z_m = level_m, level_z_m
 
     def _take_guide(self, fix: Fix) -> None:
         guide = fix.guide

@@ -13,7 +13,7 @@ from lumidock.go_no_go import Advice, Passage, advise
 
 State = Literal["search", "approach", "hold", "enter", "docked", "back_out", "abort"]
 DOCKED_M = 0.15  # the camera has to be so near to the docking point
-_STOPPED_M, _STILL_M_S = 0.08, 0.05  # where the vehicle says that it is docked: half of that, at rest
+_STOPPED_M, _STILL_M_S = 0.10, 0.10  # where the vehicle says that it is docked: two thirds of that, and how slow
 _BLIND_STOP_M = 10.0  # before the entrance, beyond which the search does not go without a guide
 _SEARCH_S, _HOLD_S, _DOCKING_S = 60.0, 25.0, 25.0  # longest times of search, hold, and of the end at the docking point
 _BACK_TO_M, _BACK_M_S = 6.0, 0.3  # where the vehicle backs out to, and how fast
@@ -115,7 +115,8 @@ class Machine:
         """Where the state wants the vehicle."""
         before_m, gate_m = -navigator.position[0], self.passage.gate_m
         fast = speed_known(navigator, self.model)
-        brake = math.sqrt(2.0 * self.passage.brake_m_s2 * max(before_m - gate_m, 0.0)) + self.model.entry_m_s
+        # half of the braking that the go / no-go reckons with, so that it is not too fast at the gate
+        brake = math.sqrt(self.model.entry_m_s**2 + self.passage.brake_m_s2 * max(before_m - gate_m, 0.0))
         if self.state == "search":
             return Course(-_BLIND_STOP_M, min(fast, brake))
         if self.state == "approach":

@@ -26,7 +26,8 @@ class VehicleModel:
     """A vehicle's parameters; each of four numbers is for surge, sway, heave (kg, N s/m, N s2/m2, N) and yaw.
 
     `mass` without and `added` of the water; `linear` and `quadratic` drag; `thrust` the most that the thrusters give,
-    which they follow with the time constant `thruster_lag_s`. `half_m` is half of length, width and height of the hull;
+    which they follow with the time constant `thruster_lag_s`; where the same thrusters give surge, sway and yaw,
+    `shared_n` is the most of |surge| + |sway| + |yaw| / `yaw_arm_m`. `half_m` is half of length, width and height of the hull;
     the camera looks ahead from the middle of the nose. `cruise_m_s` is the speed far from the dock, `entry_m_s` inside.
     """
 
@@ -40,6 +41,8 @@ class VehicleModel:
     half_m: Three
     cruise_m_s: float
     entry_m_s: float
+    shared_n: float = math.inf
+    yaw_arm_m: float = 1.0
 
     @property
     def radius_m(self) -> float:
@@ -51,6 +54,13 @@ class VehicleModel:
         """Mass and added mass of each degree of freedom, kg and kg m2."""
         surge, sway, heave, yaw = (m + a for m, a in zip(self.mass, self.added, strict=True))
         return surge, sway, heave, yaw
+
+    def within_limits(self, wanted: Four) -> Four:
+        """The thrust that the thrusters can give of what is `wanted`."""
+        surge, sway, heave, yaw = (max(-m, min(m, force)) for force, m in zip(wanted, self.thrust, strict=True))
+        together = abs(surge) + abs(sway) + abs(yaw) / self.yaw_arm_m
+        share = min(1.0, self.shared_n / together) if together else 1.0
+        return surge * share, sway * share, heave, yaw * share
 
 
 # REMUS 100 (T. Prestero, "Verification of a Six-Degree of Freedom Simulation Model for the REMUS Autonomous Underwater
@@ -72,18 +82,20 @@ AUV = VehicleModel(
 )
 # BlueROV2 Heavy (M. von Benzon et al., "An Open-Source Benchmark Simulator: Control of a BlueROV2 Underwater Robot", J.
 # Mar. Sci. Eng. 10, 1898, 2022): 13.5 kg, 0.46 by 0.58 by 0.38 m. Thrusters T200 at 16 V give 40 N backward
-# (manufacturer's data): four at 45 degrees share surge, sway and yaw, each of which gets half of what they could give.
+# (manufacturer's data): four at 45 degrees, 0.27 m from the middle, share surge, sway and yaw.
 ROV = VehicleModel(
     name="rov",
     mass=(13.5, 13.5, 13.5, 0.37),
     added=(6.36, 7.12, 18.68, 0.222),
     linear=(13.7, 0.0, 33.0, 0.0),
     quadratic=(141.0, 217.0, 190.0, 1.5),
-    thrust=(56.0, 56.0, 80.0, 12.0),
+    thrust=(113.0, 113.0, 80.0, 12.0),
     thruster_lag_s=0.15,
     half_m=(0.23, 0.29, 0.19),
-    cruise_m_s=0.6,
+    cruise_m_s=0.7,
     entry_m_s=0.3,
+    shared_n=113.0,
+    yaw_arm_m=0.27,
 )
 VEHICLES = {vehicle.name: vehicle for vehicle in (AUV, ROV)}
 _ROCKING_S = (4.0, 9.0)  # shortest and longest period of roll and pitch: swell
@@ -104,12 +116,10 @@ class Motion:
         """Move on by `dt_s` with the `wanted` thrust, in a `current` in `approach`; semi-implicit Euler."""
         model = self.model
         share = 1.0 - math.exp(-dt_s / model.thruster_lag_s)
-        limited = [max(-most, min(most, force)) for force, most in zip(wanted, model.thrust, strict=True)]
+        limited = model.within_limits(wanted)
         surge, sway, heave, yaw = (now + share * (to - now) for now, to in zip(self.thrust, limited, strict=True))
         self.thrust = (surge, sway, heave, yaw)
-        u, v, _, r = self.through_water
-        mu, mv, _, _ = model.inertia
-        coriolis = (mv * v * r, -mu * u * r, 0.0, (model.added[0] - model.added[1]) * u * v)
+        coriolis = coriolis_of(model, self.through_water)
         new = [
             # drag at the new speed: stable for any step
             (speed + dt_s * (force + turning) / inertia) / (1.0 + dt_s * (linear + quadratic * abs(speed)) / inertia)
@@ -126,6 +136,17 @@ class Motion:
         x, y, z = self.position
         self.position = (x + dt_s * forward, y + dt_s * left, z + dt_s * up)
         self.over_ground = (c * forward + s * left, -s * forward + c * left, up, new[3])
+
+
+def coriolis_of(model: VehicleModel, through_water: Four) -> Four:
+    """Forces of turning, and the moment that turns a long hull across the flow, by mass and added mass."""
+    u, v, _, r = through_water
+    return (
+        model.inertia[1] * v * r,
+        -model.inertia[0] * u * r,
+        0.0,
+        (model.added[0] - model.added[1]) * u * v,
+    )
 
 
 def body_drag(model: VehicleModel, axis: int, speed: float) -> float:

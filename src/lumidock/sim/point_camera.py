@@ -33,7 +33,11 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class PointCamera:
-    """The camera of one docking, with all that is drawn once for it. `rows` are the frames that arrive, by number."""
+    """The camera of one docking, with all that is drawn once for it.
+
+    `front` (M,): which lights are of the front layer; `shown` (M,): which are of a layer that is lit; `rows`: the frames
+    that arrive, by number.
+    """
 
     scenario: Scenario
     station: Station
@@ -43,15 +47,17 @@ class PointCamera:
     wander_uv: Array
     glints: tuple[Array, np.ndarray]
     attitude_bias_rad: Array
+    front: np.ndarray
+    shown: np.ndarray
     rows: dict[int, Row]
     rng: np.random.Generator
 
     def see(self, number: int, T_dock_cam: Array) -> Seen:
         """The detections of frame `number`, taken from the true pose `T_dock_cam` (4, 4)."""
-        one = _one_frame(self.course, number, T_dock_cam)
-        uv, visible = self._project(one)
-        lit = visible & ~self._dark(number, visible)
-        spurious = self._spurious(number, one, uv[visible])
+        one = one_frame(self.course, number, T_dock_cam)
+        uv, visible = self.project(one)
+        lit = visible & ~self.dark(number, visible)
+        spurious = self.spurious(number, one, uv[visible])
         light = np.concatenate([np.flatnonzero(lit), np.full(len(spurious), -1)])
         where = np.concatenate([uv[lit], spurious])
         where = where + self.rng.normal(0.0, self.scenario.detections.noise_px, where.shape)
@@ -68,7 +74,7 @@ class PointCamera:
         )
         return Seen(detections, light)
 
-    def _project(self, one: Course) -> tuple[Array, np.ndarray]:
+    def project(self, one: Course) -> tuple[Array, np.ndarray]:
         """Pixels (M, 2) of the lights where they truly are, through the true lens; which of them (M,) can be seen."""
         uv, p_cam = project_each(self.camera, one.T_dock_cam, self.drawn.p_dock)
         uv = (uv[0] - self.camera.center_px) * (1.0 + self.drawn.focal[0])
@@ -76,22 +82,23 @@ class PointCamera:
         near = np.linalg.norm(p_cam[0], axis=1) < self.drawn.reach_m[0]
         shining = shines(self.station.axis, self.scenario, one.T_dock_cam, self.drawn.p_dock)[0]
         ahead = p_cam[0][:, 2] > 0.0
-        return uv, self.camera.contains(uv) & near & ahead & shining & shown_layers(self.scenario, self.station)
+        return uv, self.camera.contains(uv) & near & ahead & shining & self.shown
 
-    def _dark(self, number: int, visible: np.ndarray) -> np.ndarray:
+    def dark(self, number: int, visible: np.ndarray) -> np.ndarray:
         """Which lights (M,) give no detection although they are in view."""
         knobs, t_s = self.scenario.detections, float(self.course.t_ns[number]) * 1e-9
         dark = self.drawn.dead[0] | (self.rng.random(len(visible)) < knobs.drop)
         dark |= failed(self.scenario, self.station, np.array([t_s]))[0] | bool(self.drawn.black[number])
-        front = self.station.layer == self.station.layers.index(self.station.layers_front_to_rear()[0])
         if any(first <= t_s <= last for first, last in knobs.front_off_s):
-            dark |= front
-        among = np.flatnonzero(visible & front)
+            dark |= self.front
+        if self.scenario.faults.missing[1] == 0:
+            return dark
+        among = np.flatnonzero(visible & self.front)
         count = min(int(self.rng.integers(*self.scenario.faults.missing, endpoint=True)), len(among))
         dark[self.rng.choice(among, count, replace=False)] = True
         return dark
 
-    def _spurious(self, number: int, one: Course, lights_uv: Array) -> Array:
+    def spurious(self, number: int, one: Course, lights_uv: Array) -> Array:
         """Pixels (S, 2) of spurious detections: those that wander, those of this frame alone, and glints."""
         if self.drawn.black[number]:
             return np.empty((0, 2))
@@ -101,15 +108,17 @@ class PointCamera:
             margin = 0.25 * np.ptp(lights_uv, axis=0)
             low, high = np.maximum(low, lights_uv.min(axis=0) - margin), np.minimum(high, lights_uv.max(axis=0) + margin)
         new = low + self.rng.random((int(self.rng.poisson(knobs.clutter)), 2)) * (high - low)
+        if not self.glints[1].any():
+            return np.concatenate([self.wander_uv[number], new])
         fixed = seen_glints(knobs, self.camera, one, self.glints, np.zeros(1, bool))[1]
         return np.concatenate([self.wander_uv[number], new, fixed])
 
     def _p_rear(self, light: Indices) -> Array:
         if not self.scenario.detections.color:
             return np.full(len(light), np.nan)
-        rear = (light >= 0) & (self.station.layer[light] == self.station.layers.index(self.station.layers_front_to_rear()[-1]))
+        rear = (light >= 0) & ~self.front[light]
         rear ^= self.rng.random(len(light)) < self.scenario.detections.wrong_layer
-        return np.where(rear & (len(self.station.layers) > 1), _P_REAR[1], _P_REAR[0])
+        return np.where(rear, _P_REAR[1], _P_REAR[0])
 
     def _attitude(self, T_dock_cam: Array) -> Attitude | None:
         knobs = self.scenario.detections.attitude
@@ -148,12 +157,14 @@ def point_camera(scenario: Scenario, station: Station, camera: Camera, seed: int
         ),
         glints=glints(knobs, drawn.p_dock, drawn.dead, np.random.default_rng([seed, Draw.STRUCTURE_GLINTS])),
         attitude_bias_rad=bias * np.deg2rad(knobs.attitude.bias_deg if knobs.attitude else 0.0),
+        front=station.layer == station.layers.index(station.layers_front_to_rear()[0]),
+        shown=shown_layers(scenario, station),
         rows={row.number: row for row in rows_of(scenario.stream, t_ns, np.random.default_rng([seed, Draw.STREAM_FAULTS]))},
         rng=np.random.default_rng([seed, Draw.DETECTIONS]),
     )
 
 
-def _one_frame(course: Course, number: int, T_dock_cam: Array) -> Course:
+def one_frame(course: Course, number: int, T_dock_cam: Array) -> Course:
     """A course of one frame."""
     first = np.zeros(1, np.int64)
     return Course(course.t_ns[number : number + 1], T_dock_cam[None], first, first, first, course.surface_m)
