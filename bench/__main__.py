@@ -14,6 +14,7 @@ from pathlib import Path
 from bench import (
     acquisition,
     association,
+    closed_loop,
     configuration,
     contact_sheet,
     detection,
@@ -35,6 +36,7 @@ BENCHES = {
     "acquisition": acquisition,
     "nominal": nominal,
     "association": association,
+    "closed-loop": closed_loop,
     "table1": table1,
     "images": images,
     "speed": speed,

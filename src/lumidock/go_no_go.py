@@ -1,8 +1,8 @@
 """Go or no-go: whether a vehicle may go on into the dock, as a verdict of its own with the word why.
 
 It rests on where the vehicle is and how well that is known against the dock's opening, on the closing speed and on the
-time since the last fix. A pure function of one `Situation`, for a simulated vehicle and for `serve` alike; `Watch` keeps
-the last fix between frames for those who have nothing but fixes.
+time since the last fix. A pure function of one `Situation`, for a simulated vehicle and for `serve` alike; `Watch`
+keeps the last fix between frames for those who have nothing but fixes.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from lumidock.station import Station
 
 Verdict = Literal["go", "hold", "abort"]
 CONTRADICTED = ("survey", "calibration")  # reasons of a fix that end a docking: the files do not describe what is seen
+DRIFT_M_S = 0.5  # of a vehicle that does not know its own motion, in the strongest current that is docked in
+_SPEED_MEMORY_S = 0.5  # over which the closing speed between fixes is smoothed
 WORDS = {
     "clear": "Position, its level and the speed leave room in the opening.",
     "approach": "Outside the gate, and the way to it is known.",
@@ -46,7 +48,7 @@ class Passage:
     gate_m: float = 3.0
     brake_m_s2: float = 0.1
     entry_m_s: float = 0.5
-    blind_s: float = 10.0
+    blind_s: float = 20.0
 
     @property
     def clearance_m(self) -> float:
@@ -114,7 +116,7 @@ class Watch:
     """The last usable fix and what followed, for those who have only fixes; `drift_m_s` is how fast a level grows."""
 
     passage: Passage
-    drift_m_s: float = 0.5  # a vehicle that does not know itself moving is carried by the current
+    drift_m_s: float = DRIFT_M_S
     fix: Fix | None = None
     pose: Fix | None = None
     guide: Fix | None = None
@@ -126,7 +128,8 @@ class Watch:
         if fix.T_dock_cam is not None and self.pose is not None and self.pose.T_dock_cam is not None:
             lapse_s = (fix.t_ns - self.pose.t_ns) * 1e-9
             if lapse_s > 0.0:
-                closing_m_s = float(self.pose.T_dock_cam[2, 3] - fix.T_dock_cam[2, 3]) / lapse_s
+                now_m_s = float(self.pose.T_dock_cam[2, 3] - fix.T_dock_cam[2, 3]) / lapse_s
+                closing_m_s += min(1.0, lapse_s / _SPEED_MEMORY_S) * (now_m_s - closing_m_s)
         return replace(
             self,
             fix=fix,
@@ -156,19 +159,23 @@ class Watch:
             self.passage,
         )
 
+    @property
+    def _guided(self) -> bool:
+        """Whether a guide is newer than any pose."""
+        return self.guide is not None and (self.pose is None or self.guide.t_ns > self.pose.t_ns)
+
     def _place(self) -> tuple[float, float, float]:
         """The last known position in `dock`; of a guide alone only the distance is known, and stands for z."""
-        if self.pose is not None and self.pose.T_dock_cam is not None:
-            if self.guide is None or self.guide is self.pose or self.pose.t_ns >= self.guide.t_ns:
-                x, y, z = (float(value) for value in self.pose.T_dock_cam[:3, 3])
-                return x, y, z
+        if not self._guided and self.pose is not None and self.pose.T_dock_cam is not None:
+            x, y, z = (float(value) for value in self.pose.T_dock_cam[:3, 3])
+            return x, y, z
         if self.guide is not None and self.guide.guide is not None:
             return 0.0, 0.0, self.guide.guide.range_m
         return 0.0, 0.0, math.inf
 
     def _levels(self) -> tuple[float, float]:
         """Levels across and along the axis of what `_place` gives; a method without levels is taken at its word."""
-        if self.pose is None or (self.guide is not None and self.guide.t_ns > self.pose.t_ns):
+        if self._guided or self.pose is None:
             return math.inf, self.guide.guide.pl_range_m if self.guide and self.guide.guide else math.inf
         protection = self.pose.protection
         return (protection.lateral_m, protection.axial_m) if protection else (0.0, 0.0)

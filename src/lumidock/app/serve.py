@@ -19,6 +19,7 @@ import numpy as np
 from lumidock.app.run import process
 from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import LumidockError
+from lumidock.go_no_go import Watch
 from lumidock.methods import Method
 from lumidock.streams.sinks import Sink
 from lumidock.streams.source import Item
@@ -258,6 +259,7 @@ class Server:
     arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
     latency_us: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
     last: Fix | None = None
+    watch: Watch | None = None  # of the go / no-go
     started_s: float = field(default_factory=time.monotonic)
 
     def serve(self) -> None:
@@ -296,6 +298,8 @@ class Server:
         if fix.reason:
             self.reasons[fix.reason] += 1
         self.last = fix
+        if self.watch is not None:
+            self.watch = self.watch.after(fix)
         return fix.stage
 
     def health(self) -> dict[str, Any]:
@@ -321,6 +325,7 @@ class Server:
                 "last": None if last is None else {"status": last.status, "stage": last.stage, "reason": last.reason},
                 "latency_ms": percentiles([us / 1000.0 for us in list(self.latency_us)]),
             },
+            "go_no_go": self._advice(age_s),
             "sinks": {
                 worker.name: {
                     **{word: getattr(worker, word) for word in ("sent", "dropped", "stale", "errors", "problem")},
@@ -329,6 +334,14 @@ class Server:
                 for worker in self.workers
             },
         }
+
+    def _advice(self, age_s: float | None) -> dict[str, str] | None:
+        """The go / no-go as it is by now; None without the vehicle's size."""
+        if self.watch is None:
+            return None
+        t_ns = 0 if self.last is None or age_s is None else self.last.t_ns + round(age_s * 1e9)
+        advice = self.watch.advise(t_ns)
+        return {"verdict": advice.verdict, "word": advice.word}
 
 
 def percentiles(values: list[float]) -> dict[str, float]:

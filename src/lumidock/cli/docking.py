@@ -145,7 +145,7 @@ def _view(docking: Docking, one: InFull) -> DockingView:
         station=docking.station,
         t_s=np.array([m.t_s for m in moments]),
         true_dock=np.array([m.T_dock_cam[:3, 3] for m in moments]),
-        believed_dock=np.array([m.believed for m in moments]) @ R_DOCK_APPROACH.T,
+        reckoned_dock=np.array([m.reckoned for m in moments]) @ R_DOCK_APPROACH.T,
         level_m=np.array([m.level_m for m in moments]),
         state=[m.step.state for m in moments],
         verdict=[m.step.advice.verdict for m in moments],

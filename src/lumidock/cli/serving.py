@@ -52,6 +52,7 @@ from lumidock.cli.shared import (
 )
 from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
+from lumidock.go_no_go import DRIFT_M_S, Passage, Watch
 from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
@@ -74,6 +75,19 @@ LiveSource = Annotated[
 MavlinkOption = Annotated[
     str | None,
     typer.Option("--mavlink", metavar="HOST:PORT", help="Send VISION_POSITION_ESTIMATE by UDP; needs --vehicle."),
+]
+HullRadius = Annotated[
+    float | None,
+    typer.Option(
+        "--hull-radius",
+        metavar="M",
+        min=0.01,
+        help="Of a circle that holds the vehicle's cross-section: gives the go / no-go, in health and by MAVLink.",
+    ),
+]
+Drift = Annotated[
+    float,
+    typer.Option("--drift", metavar="M/S", min=0.0, help="How fast the vehicle may move unnoticed, as in a current."),
 ]
 ZenohOption = Annotated[
     str | None,
@@ -119,6 +133,8 @@ def _serve(
     config: ConfigOption = None,
     loop: Annotated[bool, typer.Option("--loop", help="Show a recording again and again.")] = False,
     mavlink: MavlinkOption = None,
+    hull_radius: HullRadius = None,
+    drift: Drift = DRIFT_M_S,
     zenoh: ZenohOption = None,
     dds: Annotated[bool, typer.Option("--dds", help="Publish to ROS 2 by DDS.")] = False,
     domain: Annotated[int, typer.Option(metavar="N", min=0, max=232, help="ROS_DOMAIN_ID.")] = 0,
@@ -152,6 +168,9 @@ def _serve(
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
         ]
         server = _server(opened, _ready_localizer(method, setting, settings), setting.camera, sinks, loop=loop)
+        if hull_radius is not None:
+            server.watch = Watch(Passage.of(setting.station, hull_radius), drift)
+            sinks += _go_no_go_sinks(server.watch, mavlink)
         page = _health_page(host, health_port, server)
         stack.callback(page.close)
         # last of all, so that a start that fails leaves what is on the disk alone
@@ -234,6 +253,16 @@ def _vehicle_sinks(
             from lumidock.streams.ddslink import DdsLink
         workers.append(Worker("dds", partial(DdsLink, dds, host != _LOOPBACK, *shared), queue=_SHORT))
     return workers
+
+
+def _go_no_go_sinks(watch: Watch, mavlink: str | None) -> list[Worker]:
+    """The go / no-go by MAVLink, to where the fixes go."""
+    if mavlink is None:
+        return []
+    with extra("mavlink"):
+        from lumidock.streams.go_no_go_link import GoNoGoLink
+    name, port = _host_and_port("--mavlink", mavlink)
+    return [Worker("go-no-go", partial(GoNoGoLink, name, port, watch), queue=1, stale_s=STALE_S, pictures=False)]
 
 
 def _viewer_sinks(setting: Setting, foxglove_port: int | None, rerun: str | None, host: str) -> list[Worker]:

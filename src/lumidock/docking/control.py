@@ -1,4 +1,6 @@
-"""From a wanted velocity and heading to thrust: speed loops with drag and turning forces fed forward, gains from the vehicle alone.
+"""From a wanted velocity and heading to thrust: speed loops with drag and turning forces fed forward.
+
+All gains follow from the vehicle.
 
 The speed loop has a quarter of the bandwidth of the thrusters, the loop of position or heading around it a quarter of
 that: each is then critically damped (a cascade of first-order lags 1/T and gain 1/(4 T) has a double pole at -1/(2 T)).

@@ -19,18 +19,22 @@ from lumidock.streams.overlay import brightened
 from lumidock.streams.sinks import open_video
 
 _SHARE = 0.25  # of the camera's width; a picture of the whole sensor takes seconds
-_SIDE_M, _AHEAD_M, _BEHIND_M = 2.0, 6.0, 6.0  # what the plan shows beside, before and behind the entrance
+_MOST_PICTURES = 150  # of a film
+_SIDE_M, _AHEAD_M, _BEHIND_M = 2.5, 6.0, 12.0  # what the plan shows beside, before and behind the entrance
 _COLORS = {"go": "#4cc38a", "hold": "#ffc24a", "abort": "#ff5a5f"}
 _INK, _GROUND, _FONT = (225, 225, 225), (38, 28, 20), cv2.FONT_HERSHEY_SIMPLEX
+_SHADE = 0.35  # of its brightness is left of the picture behind a text
 _HULL = bgr("#e29bff")
 
 
 def film(docking: Docking, moments: Sequence[Moment], path: Path) -> None:
-    """Write the film, every frame of the docking at its own time. Raises: InputError without the extra `video`."""
+    """Write the film, each picture at its own time. Raises: InputError without the extra `video`."""
+    every = math.ceil(len(moments) / _MOST_PICTURES)
     writer = open_video(path)
     eye = RenderedCamera(camera_of(docking, scaled(docking.camera, _SHARE), len(moments)), docking.seed)
     try:
-        for number, moment in enumerate(moments):
+        for number in range(0, len(moments), every):
+            moment = moments[number]
             frame = eye.see(number, moment.T_dock_cam)
             picture = brightened(developed(frame))[0]
             view = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else picture.copy()
@@ -62,7 +66,9 @@ def _captions(view: Image, moment: Moment) -> None:
         (f"{told}   level {min(moment.level_m, 99.0):.2f} m", _INK),
     ]
     for k, (text, color) in enumerate(lines):
-        cv2.putText(view, text, (10, 20 + 20 * k), _FONT, 0.48, (0, 0, 0), thickness=3, lineType=cv2.LINE_AA)
+        (width, height), below = cv2.getTextSize(text, _FONT, 0.48, 1)
+        ground = view[20 + 20 * k - height - 2 : 20 + 20 * k + below, 6 : 14 + width]
+        ground[...] = (ground * _SHADE).astype(np.uint8)
         cv2.putText(view, text, (10, 20 + 20 * k), _FONT, 0.48, color, thickness=1, lineType=cv2.LINE_AA)
 
 

@@ -1,7 +1,7 @@
 """Line of sight with crab angle, at a speed by what is known, through the paper's four stages.
 
-The docking stages of the paper (section 2.2) set the speeds: search slowly, approach on the front layer at cruising speed,
-slow down where both layers are seen, enter on the rear layer at entry speed.
+The docking stages of the paper (section 2.2) set the speeds: search slowly, approach on the front layer at cruising
+speed, slow down where both layers are seen, enter on the rear layer at entry speed.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def speed_known(navigator: Navigator, model: VehicleModel) -> float:
 def steer(navigator: Navigator, course: Course, gain: float, current: Three) -> Wanted:
     """Velocity and heading on the docking axis toward a point on it; `gain` is that of the position loop, 1/s.
 
-    Source: line of sight with a lookahead of speed / gain, Fossen 2011, section 10.3; the crab angle is the direction of
-    the wanted velocity through the water.
+    Source: line of sight with a lookahead of speed / gain, Fossen 2011, section 10.3; the crab angle is the direction
+    of the wanted velocity through the water.
     """
     x, left, up = navigator.position
     to_go = course.ahead_m - x

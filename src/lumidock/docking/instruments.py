@@ -9,11 +9,10 @@ import numpy as np
 
 from lumidock.docking.vehicle import Motion, Three, VehicleModel
 
-_DVL_SCALE, _DVL_BIAS_M_S, _DVL_NOISE_M_S = 0.01, 0.003, 0.01  # 1 sigma. Source: Water Linked A50, data sheet
+DVL_SCALE, DVL_BIAS_M_S, _DVL_NOISE_M_S = 0.01, 0.003, 0.01  # 1 sigma. Source: Water Linked A50, data sheet
 _GYRO_BIAS_RAD_S, _GYRO_NOISE_RAD_S = math.radians(0.05), math.radians(0.1)  # industrial MEMS, bias in run
 HEADING_SIGMA_RAD, TILT_SIGMA_RAD = math.radians(2.0), math.radians(0.3)  # compass beside steel; inclinometers
 HOMING_SIGMA_M = 1.0  # of each axis at 20 m: ultra-short baseline of 3 degrees
-DVL_SIGMA_M_S = 0.006  # what the guidance reckons with: the bias, and the scale at 0.5 m/s
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +43,8 @@ class Instruments:
         """The instruments of one docking."""
         bx, by, bz, hx, hy, hz, scale, gyro, heading, pitch, roll = (float(value) for value in rng.normal(size=11))
         return cls(
-            scale=1.0 + _DVL_SCALE * scale,
-            bias=(_DVL_BIAS_M_S * bx, _DVL_BIAS_M_S * by, _DVL_BIAS_M_S * bz),
+            scale=1.0 + DVL_SCALE * scale,
+            bias=(DVL_BIAS_M_S * bx, DVL_BIAS_M_S * by, DVL_BIAS_M_S * bz),
             gyro_bias=_GYRO_BIAS_RAD_S * gyro,
             heading_bias=HEADING_SIGMA_RAD * heading,
             tilt_bias=(TILT_SIGMA_RAD * pitch, TILT_SIGMA_RAD * roll),

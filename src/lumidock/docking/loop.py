@@ -19,7 +19,7 @@ from lumidock.docking.instruments import Instruments
 from lumidock.docking.methods import docking_method
 from lumidock.docking.navigation import Navigator
 from lumidock.docking.states import DOCKED_M, Machine, Step, Transition
-from lumidock.docking.vehicle import R_DOCK_APPROACH, Current, Motion, Rocking, Three, T_dock_cam_of, VehicleModel
+from lumidock.docking.vehicle import R_DOCK_APPROACH, Current, Motion, Rocking, T_dock_cam_of, Three, VehicleModel
 from lumidock.go_no_go import Advice, Passage
 from lumidock.methods import Method
 from lumidock.sim.draws import Draw
@@ -53,11 +53,11 @@ class Docking:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """One frame of a docking: the truth, what the vehicle believed, what it decided, and the fix, if a frame came."""
+    """One frame of a docking: the truth, what the vehicle reckoned, what it decided, and the fix, if a frame came."""
 
     t_s: float
     T_dock_cam: Array
-    believed: Three  # the camera's position in approach
+    reckoned: Three  # the camera's position in approach
     level_m: float
     step: Step
     fix: Fix | None
@@ -287,11 +287,11 @@ def is_misleading(moment: Moment, station: Station) -> bool:
         return False
     error = fix.T_dock_cam[:3, 3] - moment.T_dock_cam[:3, 3]
     lateral_m, axial_m, _ = station.alert_limits.of_pose(float(fix.T_dock_cam[2, 3]), 0.0)
-    return math.hypot(error[0], error[1]) > lateral_m or abs(error[2]) > axial_m
+    return bool(math.hypot(error[0], error[1]) > lateral_m or abs(error[2]) > axial_m)
 
 
 def had_a_cause(docking: Docking, pilot: Pilot) -> bool:
-    """Whether an abort was right: the station is not as surveyed, too few lights were seen, or the way in was missed."""
+    """Whether an abort was right: the station is not as surveyed, too few lights were seen, or the way was missed."""
     knobs = docking.scenario
     if knobs.docking.station_off_m > 0.0 or knobs.detections.bent_m > 0.0 or knobs.lens.focal_error != 0.0:
         return True
@@ -299,7 +299,7 @@ def had_a_cause(docking: Docking, pilot: Pilot) -> bool:
     before = [one for one in pilot.moments if leaving - pilot.machine.passage.blind_s <= one.t_s <= leaving]
     dark = sum(one.lights_seen < _POSE_LIGHTS for one in before) > 0.5 * len(before)
     x, y, z = before[-1].T_dock_cam[:3, 3]
-    return dark or (z < pilot.machine.passage.gate_m and math.hypot(x, y) > pilot.machine.passage.clearance_m)
+    return bool(dark or (z < pilot.machine.passage.gate_m and math.hypot(x, y) > pilot.machine.passage.clearance_m))
 
 
 def advice_of(moment: Moment) -> Advice:

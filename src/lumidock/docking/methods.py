@@ -55,6 +55,4 @@ class RawPoses:
             return replace(fix, guide=None)
         T_cam_dock = np.eye(4)
         T_cam_dock[:3, :3], T_cam_dock[:3, 3] = tracks[0].state.R, tracks[0].state.t
-        return replace(
-            fix, T_dock_cam=se3_inverse(T_cam_dock), reason="", covariance=None, protection=None, guide=None
-        )
+        return replace(fix, T_dock_cam=se3_inverse(T_cam_dock), reason="", covariance=None, protection=None, guide=None)

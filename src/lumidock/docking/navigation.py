@@ -1,8 +1,9 @@
 """Where the vehicle takes itself to be: by the last usable fix, and reckoned with its own instruments since then.
 
-A valid pose replaces what was known, unless that has smaller levels and agrees. A guide (bearing and range) gives a
-position with the vehicle's own attitude, and replaces what is known where its level is smaller. Between fixes velocity over ground and yaw rate are integrated,
-and the levels grow by what these may be wrong. Positions are those of the camera, in `approach`.
+A valid pose replaces what was known, across and along the axis, unless that has a smaller level and agrees. A guide
+(bearing and range) gives a position with the vehicle's own attitude, and replaces what is known where its level is
+smaller. Between fixes velocity over ground and yaw rate are integrated, and the levels grow by what these may be wrong.
+Positions are those of the camera, in `approach`.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lumidock.datatypes import Array, Fix
-from lumidock.docking.instruments import DVL_SIGMA_M_S, HEADING_SIGMA_RAD, HOMING_SIGMA_M, Reading
-from lumidock.docking.vehicle import R_BODY_CAM_AHEAD, R_DOCK_APPROACH, Three, VehicleModel, T_dock_cam_of
+from lumidock.docking.instruments import DVL_BIAS_M_S, DVL_SCALE, HEADING_SIGMA_RAD, HOMING_SIGMA_M, Reading
+from lumidock.docking.vehicle import R_BODY_CAM_AHEAD, R_DOCK_APPROACH, T_dock_cam_of, Three, VehicleModel
 from lumidock.go_no_go import Situation
 
 _LEVEL_SIGMAS = 5.0  # of a level over its 1 sigma: two dimensions at 1e-6 have 5.3
@@ -56,9 +57,9 @@ class Navigator:
             z + dt_s * self.velocity[2],
         )
         speed = math.hypot(u, v)
-        grown = _LEVEL_SIGMAS * dt_s * math.hypot(DVL_SIGMA_M_S, self.heading_sigma_rad * speed)
-        self.level_m += grown
-        self.level_z_m += grown
+        # of a wrong heading the vehicle drifts aside, of a wrong scale it comes too far or not far enough
+        self.level_m += _LEVEL_SIGMAS * dt_s * math.hypot(DVL_BIAS_M_S, self.heading_sigma_rad * speed)
+        self.level_z_m += _LEVEL_SIGMAS * dt_s * math.hypot(DVL_BIAS_M_S, DVL_SCALE * speed)
         self.since_fix_s += dt_s
         self.since_guide_s += dt_s
 
@@ -74,13 +75,14 @@ class Navigator:
         self.since_fix_s = self.since_guide_s = 0.0
         level_m, level_z_m = (fix.protection.lateral_m, fix.protection.axial_m) if fix.protection else (0.0, 0.0)
         x, y, z = (float(value) for value in R_DOCK_APPROACH.T @ T_dock_cam[:3, 3])
+        if level_z_m <= self.level_z_m or abs(x - self.position[0]) > level_z_m:
+            self.position, self.level_z_m = (x, *self.position[1:]), level_z_m
         apart_m = math.hypot(y - self.position[1], z - self.position[2])
-        if level_m > self.level_m and level_z_m > self.level_z_m and apart_m < level_m:
+        if level_m > self.level_m and apart_m < level_m:
             return  # what an earlier pose and the own instruments say is better known, and agrees
         ahead = R_DOCK_APPROACH.T @ T_dock_cam[:3, :3] @ R_BODY_CAM_AHEAD.T[:, 0]
-        self.position, self.heading_rad = (x, y, z), math.atan2(float(ahead[1]), float(ahead[0]))
-        self.heading_sigma_rad = _YAW_KNOWN_RAD
-        self.level_m, self.level_z_m = level_m, level_z_m
+        self.position, self.level_m = (self.position[0], y, z), level_m
+        self.heading_rad, self.heading_sigma_rad = math.atan2(float(ahead[1]), float(ahead[0])), _YAW_KNOWN_RAD
 
     def _take_guide(self, fix: Fix) -> None:
         guide = fix.guide

@@ -27,8 +27,9 @@ class VehicleModel:
 
     `mass` without and `added` of the water; `linear` and `quadratic` drag; `thrust` the most that the thrusters give,
     which they follow with the time constant `thruster_lag_s`; where the same thrusters give surge, sway and yaw,
-    `shared_n` is the most of |surge| + |sway| + |yaw| / `yaw_arm_m`. `half_m` is half of length, width and height of the hull;
-    the camera looks ahead from the middle of the nose. `cruise_m_s` is the speed far from the dock, `entry_m_s` inside.
+    `shared_n` is the most of |surge| + |sway| + |yaw| / `yaw_arm_m`. `half_m` is half of length, width and height of
+    the hull; the camera looks ahead from the middle of the nose. `cruise_m_s` is the speed far from the dock,
+    `entry_m_s` inside.
     """
 
     name: str
@@ -78,7 +79,7 @@ AUV = VehicleModel(
     thruster_lag_s=0.2,
     half_m=(0.665, 0.15, 0.15),
     cruise_m_s=0.8,
-    entry_m_s=0.3,
+    entry_m_s=0.35,
 )
 # BlueROV2 Heavy (M. von Benzon et al., "An Open-Source Benchmark Simulator: Control of a BlueROV2 Underwater Robot", J.
 # Mar. Sci. Eng. 10, 1898, 2022): 13.5 kg, 0.46 by 0.58 by 0.38 m. Thrusters T200 at 16 V give 40 N backward
@@ -93,7 +94,7 @@ ROV = VehicleModel(
     thruster_lag_s=0.15,
     half_m=(0.23, 0.29, 0.19),
     cruise_m_s=0.7,
-    entry_m_s=0.3,
+    entry_m_s=0.35,
     shared_n=113.0,
     yaw_arm_m=0.27,
 )

@@ -1,4 +1,4 @@
-"""The page of dockings: one in full, from above and from the side with its states and reasons, and a campaign's table."""
+"""The page of dockings: the way from above and from the side, states and reasons, and the table of a campaign."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ _VERDICTS = {"go": "transition", "hold": "front", "abort": "bad"}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DockingView:
-    """One docking of N frames: `t_s` (N,), true and believed positions (N, 3) of the camera in `dock`, the level (N,).
+    """One docking of N frames: `t_s` (N,), true and reckoned places (N, 3) of the camera in `dock`, level (N,).
 
-    `state`, `verdict` and `word` of each frame; which frames had a valid pose, and which only a guide. `changes` are the
+    `state`, `verdict` and `word` of each frame; which had a valid pose, and which only a guide. `changes` are the
     rows (time, state, reason) of the state machine. `opening_m` and `vehicle_m` are the radii of opening and vehicle.
     """
 
@@ -43,7 +43,7 @@ class DockingView:
     station: Station
     t_s: Array
     true_dock: Array
-    believed_dock: Array
+    reckoned_dock: Array
     level_m: Array
     state: Sequence[str]
     verdict: Sequence[str]
@@ -67,7 +67,9 @@ def docking_page(
         meaning = Table("Words of the go / no-go in this docking.", ["word", "meaning"], [[w, words[w]] for w in used])
         changes = Table("Changes of state, and why.", ["time, s", "state", "why"], list(view.changes))
         sections.append(
-            PageSection(view.title, tiles=view.tiles, items=[_ways(view, prefix), _times(view, prefix), changes, meaning])
+            PageSection(
+                view.title, tiles=view.tiles, items=[_ways(view, prefix), _times(view, prefix), changes, meaning]
+            )
         )
     return page.render(title, lead, sections)
 
@@ -75,9 +77,9 @@ def docking_page(
 def _ways(view: DockingView, prefix: str) -> Plot:
     caption = (
         "The camera's true way from above (x to the right) and from the side (y up), over the distance z before the "
-        "entrance, coloured by state; metres. The dashed line is where the vehicle believed to be, the band around it its "
-        "level. The dark lines are the opening inside the cage, the dotted ones the tube of contact: outside of it the hull "
-        "would touch. Stars are lights; the ring is the docking point."
+        "entrance, coloured by state; metres. The dashed line is where the vehicle reckoned to be, the band around it "
+        "its level. The dark lines are the opening inside the cage, the dotted ones the tube of contact: outside of it "
+        "the hull would touch. Stars are lights; the ring is the docking point."
     )
     return plot(f"{prefix}-ways", caption, lambda figure, narrow: _draw_ways(figure, narrow, view), (6.2, 6.6))
 
@@ -85,7 +87,7 @@ def _ways(view: DockingView, prefix: str) -> Plot:
 def _draw_ways(figure: Figure, narrow: bool, view: DockingView) -> None:
     panels = figure.subplots(2, 1, sharex=True)
     for axes, column, label in zip(panels, (0, 1), ("x, m", "y, m"), strict=True):
-        z, at = view.believed_dock[:, 2], view.believed_dock[:, column]
+        z, at = view.reckoned_dock[:, 2], view.reckoned_dock[:, column]
         shown = np.minimum(view.level_m, 5.0)
         axes.fill_between(z, at - shown, at + shown, color=COLORS["rear"], alpha=0.14, lw=0)
         axes.plot(z, at, color=COLORS["dim"], lw=0.8, ls="--")
@@ -120,9 +122,9 @@ def _draw_cage(axes: Axes, view: DockingView, column: int) -> None:
 
 def _times(view: DockingView, prefix: str) -> Plot:
     caption = (
-        "Over time in seconds: the true distance z before the entrance, coloured by state; the distance from the axis, true "
-        "(line) and believed with its level (band) against the room that the opening leaves (dotted); where there was a "
-        "valid pose or only a guide; and the go / no-go."
+        "Over time in seconds: the true distance z before the entrance, coloured by state; the distance from the axis, "
+        "true (line) and reckoned with its level (band) against the room that the opening leaves (dotted); where there "
+        "was a valid pose or only a guide; and the go / no-go."
     )
     return plot(f"{prefix}-times", caption, lambda figure, _narrow: _draw_times(figure, view), (6.4, 7.2))
 
@@ -136,9 +138,9 @@ def _draw_times(figure: Figure, view: DockingView) -> None:
     panels[0].axhline(0.0, color=COLORS["line"], lw=1)
     panels[0].set_ylabel("z, m")
     off = np.hypot(view.true_dock[:, 0], view.true_dock[:, 1])
-    believed = np.hypot(view.believed_dock[:, 0], view.believed_dock[:, 1])
-    top = believed + view.level_m
-    panels[1].fill_between(view.t_s, believed, np.minimum(top, 3.0), color=COLORS["rear"], alpha=0.16, lw=0)
+    reckoned = np.hypot(view.reckoned_dock[:, 0], view.reckoned_dock[:, 1])
+    top = reckoned + view.level_m
+    panels[1].fill_between(view.t_s, reckoned, np.minimum(top, 3.0), color=COLORS["rear"], alpha=0.16, lw=0)
     panels[1].plot(view.t_s, off, color=COLORS["ink"], lw=1.2)
     panels[1].axhline(view.opening_m - view.vehicle_m, color=COLORS["bad"], lw=1.2, ls=":")
     panels[1].set_ylim(0.0, 2.5)

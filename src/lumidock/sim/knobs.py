@@ -267,7 +267,7 @@ class StreamFaults(KnobSection):
 
 
 class DockingKnobs(KnobSection):
-    """What a vehicle meets that steers itself into the dock (`lumidock dock`); `path` then gives only the frame rate."""
+    """What a vehicle meets that steers itself into the dock; `path` then gives only the frame rate."""
 
     current_m_s: Annotated[tuple[Reach, Reach], BeforeValidator(_pair), AfterValidator(_rising)] = (0.0, 0.5)  # speed
     # 1 sigma of the turbulence over the speed of the current; 0.1 is usual in tidal flow near the bed

@@ -35,8 +35,8 @@ class Seen:
 class PointCamera:
     """The camera of one docking, with all that is drawn once for it.
 
-    `front` (M,): which lights are of the front layer; `shown` (M,): which are of a layer that is lit; `rows`: the frames
-    that arrive, by number.
+    `front` (M,): which lights are of the front layer; `shown` (M,): which are of a layer that is lit; `rows`: the
+    frames that arrive, by number.
     """
 
     scenario: Scenario
@@ -106,7 +106,10 @@ class PointCamera:
         low, high = np.full(2, -0.5), np.array([self.camera.width, self.camera.height]) - 0.5
         if knobs.place == "beside" and len(lights_uv):
             margin = 0.25 * np.ptp(lights_uv, axis=0)
-            low, high = np.maximum(low, lights_uv.min(axis=0) - margin), np.minimum(high, lights_uv.max(axis=0) + margin)
+            low, high = (
+                np.maximum(low, lights_uv.min(axis=0) - margin),
+                np.minimum(high, lights_uv.max(axis=0) + margin),
+            )
         new = low + self.rng.random((int(self.rng.poisson(knobs.clutter)), 2)) * (high - low)
         if not self.glints[1].any():
             return np.concatenate([self.wander_uv[number], new])
@@ -143,7 +146,9 @@ def point_camera(scenario: Scenario, station: Station, camera: Camera, seed: int
     course = Course(t_ns, still, np.zeros_like(stays), stays, stays, np.array([np.inf]))
     drawn = run_draws(scenario, station, course, np.random.default_rng([seed, Draw.RUN]))
     moved = bent(knobs, drawn.p_dock, np.random.default_rng([seed, Draw.BENT_LIGHT]))
-    moved = moved + np.random.default_rng([seed, Draw.STATION]).normal(size=moved.shape) * scenario.docking.station_off_m
+    moved = (
+        moved + np.random.default_rng([seed, Draw.STATION]).normal(size=moved.shape) * scenario.docking.station_off_m
+    )
     drawn = replace(drawn, p_dock=moved)
     bias = np.random.default_rng([seed, Draw.ATTITUDE]).normal(size=3)
     return PointCamera(
@@ -159,7 +164,9 @@ def point_camera(scenario: Scenario, station: Station, camera: Camera, seed: int
         attitude_bias_rad=bias * np.deg2rad(knobs.attitude.bias_deg if knobs.attitude else 0.0),
         front=station.layer == station.layers.index(station.layers_front_to_rear()[0]),
         shown=shown_layers(scenario, station),
-        rows={row.number: row for row in rows_of(scenario.stream, t_ns, np.random.default_rng([seed, Draw.STREAM_FAULTS]))},
+        rows={
+            row.number: row for row in rows_of(scenario.stream, t_ns, np.random.default_rng([seed, Draw.STREAM_FAULTS]))
+        },
         rng=np.random.default_rng([seed, Draw.DETECTIONS]),
     )
 
