@@ -85,11 +85,11 @@ def pose_fix(t_s, z):
 def test_a_watch_says_no_when_the_fixes_stop():
     watch = Watch(PASSAGE)
     assert watch.advise(0).word == "no_fix"
-    for k in range(10):
-        watch = watch.after(pose_fix(0.1 * k, 2.0 - 0.03 * k))
+    for k in range(30):
+        watch = watch.after(pose_fix(0.1 * k, 2.6 - 0.03 * k))
     assert watch.closing_m_s == pytest.approx(0.3, abs=0.01)
-    assert watch.advise(round(0.9e9)).verdict == "go"
-    later = [watch.advise(round((0.9 + lapse) * 1e9)) for lapse in (0.5, 3.0)]
+    assert watch.advise(round(2.9e9)).verdict == "go"
+    later = [watch.advise(round((2.9 + lapse) * 1e9)) for lapse in (0.5, 3.0)]
     assert [advice.word for advice in later] == ["clear", "level"]  # it may have drifted by now
     assert Watch(PASSAGE, drift_m_s=0.0, pose=watch.pose, fix=watch.fix).advise(round(40e9)).word == "no_fix"
 

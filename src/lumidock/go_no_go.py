@@ -26,7 +26,7 @@ WORDS = {
     "no_fix": "Outside the gate, and nothing tells where the dock is, or not recently enough.",
     "level": "The protection level leaves no room in the opening.",
     "off_axis": "The vehicle is beside the opening, by more than its level and its size leave room for.",
-    "too_fast": "The vehicle cannot stop before what it does not know.",
+    "too_fast": "It closes in faster than it may enter.",
     "blind": "Inside the gate, and no fix for longer than may be reckoned.",
     "survey": "What is seen contradicts the station file.",
     "calibration": "What is seen contradicts the camera file.",
