@@ -41,6 +41,7 @@ def picture() -> np.ndarray:
 
 
 def limited(value: float, most: float) -> float:
+    """The value, within plus and minus `most`."""
     return max(-most, min(most, value))
 
 
