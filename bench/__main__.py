@@ -13,6 +13,7 @@ from pathlib import Path
 
 from bench import (
     acquisition,
+    aiding,
     association,
     closed_loop,
     configuration,
@@ -24,6 +25,7 @@ from bench import (
     docks,
     images,
     lamp_weights,
+    learned_matcher,
     nominal,
     rendering,
     reproduced,
@@ -44,6 +46,8 @@ BENCHES = {
     "detector-errors": detector_errors,
     "detector-constants": detector_constants,
     "lamp-weights": lamp_weights,
+    "learned-matcher": learned_matcher,
+    "aiding": aiding,
     "dockings": dockings,
     "docks": docks,
     "visibility": visibility,

@@ -112,6 +112,7 @@ def worked(lumidock, work):
     counts = json.loads(call("eval", "run", "sequence", "--json"))
     assert counts["frames"] == FRAMES, f"eval: {counts['frames']} frames"
     assert counts["hazardous"]["valid"]["any"] == 0, "eval: hazardous poses"
+    call("warm")
     marks = {one["what"]: one["mark"] for one in json.loads(call("doctor", "--json", codes=(0, 1)))}
     assert {marks[what] for what in ("Python", "lumidock", "OpenCV", "numpy", "caches")} == {"ok"}, f"doctor: {marks}"
     call("demo")

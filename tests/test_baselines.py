@@ -5,6 +5,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from bench import learned_matcher
 from bench.shipped import shipped_camera, shipped_station
 
 from lumidock.baselines import (
@@ -12,6 +13,7 @@ from lumidock.baselines import (
     BaselineLocalizer,
     cpd,
     hungarian,
+    learned,
     neighbours,
     p3p,
     plain_pso,
@@ -202,6 +204,42 @@ def test_drift_is_local_and_misses_a_half_turn(rng):
     model = rng.normal(size=(60, 2)) * [2.0, 1.0]
     found = cpd.register(-model @ np.array([[0.98, -0.2], [0.2, 0.98]]).T, model)
     assert found.R[0, 0] > 0.5
+
+
+# A learned matcher
+
+
+def test_embeddings_do_not_depend_on_the_order_of_the_points(rng):
+    """Zaheer et al.: a sum over the set, so that a permutation of the points permutes their embeddings alike."""
+    net, xy, order = learned_matcher.begun(rng), rng.normal(size=(1, 9, 2)), rng.permutation(9)
+    first = learned.encode(net, xy, np.ones((1, 9))).out
+    np.testing.assert_allclose(learned.encode(net, xy[:, order], np.ones((1, 9))).out, first[:, order], atol=1e-12)
+
+
+def test_padding_changes_no_embedding(rng):
+    net, xy = learned.network(), rng.normal(size=(1, 9, 2))
+    there = np.array([[1.0] * 6 + [0.0] * 3])
+    alone = learned.encode(net, xy[:, :6], there[:, :6]).out
+    np.testing.assert_allclose(learned.encode(net, xy, there).out[:, :6], alone, atol=1e-12)
+
+
+def test_gradient_of_the_training_is_the_slope_of_its_loss(rng):
+    net = learned_matcher.begun(rng)
+    shifted = {f"b{k}": rng.normal(0, 0.03, getattr(net, f"b{k}").shape) for k in (1, 2, 3, 4)}  # off the kinks at 0
+    net = net._replace(**shifted)
+    batch = learned_matcher.batch_of([learned_matcher.drawn(rng, 1, 2) for _ in range(5)])
+    _, gradient = learned_matcher.loss_and_gradient(net, batch)
+    for name in net._fields:
+        step = np.zeros_like(getattr(net, name))
+        place = tuple(rng.integers(size) for size in step.shape)
+        step[place] = 1e-5
+        beside = [net._replace(**{name: getattr(net, name) + sign * step}) for sign in (1, -1)]
+        high, low = (learned_matcher.loss_and_gradient(one, batch)[0] for one in beside)
+        assert getattr(gradient, name)[place] == pytest.approx((high - low) / 2e-5, rel=1e-4, abs=1e-8), name
+
+
+def test_trained_network_holds_on_layouts_that_it_was_not_trained_on():
+    assert learned_matcher.held_out(0, 0) > 0.9
 
 
 # Poses from identified lights

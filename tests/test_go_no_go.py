@@ -79,7 +79,9 @@ def pose_fix(t_s, z):
     T_dock_cam = np.diag([1.0, -1.0, -1.0, 1.0])
     T_dock_cam[2, 3] = z
     level = Protection(0.05, 0.05, 0.02)
-    return Fix("a", round(t_s * 1e9), "tracking", "front", T_dock_cam=T_dock_cam, protection=level, covariance=np.eye(6))
+    return Fix(
+        "a", round(t_s * 1e9), "tracking", "front", T_dock_cam=T_dock_cam, protection=level, covariance=np.eye(6)
+    )
 
 
 def test_a_watch_says_no_when_the_fixes_stop():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -10,8 +12,9 @@ from lumidock.camera import Camera
 from lumidock.datatypes import Array, Frame
 from lumidock.errors import InputError
 from lumidock.geometry import so3_exp
+from lumidock.port import FlatPort
 from lumidock.setup.boards import Board, Sighting, find_board
-from lumidock.setup.water_calibration import calibrate
+from lumidock.setup.water_calibration import PortGuess, calibrate
 
 BOARD = Board("charuco", 9, 7, 0.04, 0.03)
 SIZE = (1280, 960)
@@ -59,7 +62,7 @@ def test_the_stated_errors_are_those_of_many_draws(draws, low, high):
         views, _ = _views(camera, np.random.default_rng(seed), 12, 0.2)
         got = calibrate(BOARD, views, SIZE)
         estimate = np.concatenate([got.camera.focal_px, got.camera.center_px, got.camera.distortion[:4]])
-        chi2.append(((estimate - truth) / got.sigma) ** 2)
+        chi2.append(((estimate - truth) / got.sigma[:8]) ** 2)
         assert abs(got.camera.focal_px[0] / 1110.0 - 1.0) < 5.0 * got.sigma[0] / 1110.0
     assert (np.mean(chi2, axis=0) > low).all()
     assert (np.mean(chi2, axis=0) < high).all()
@@ -149,3 +152,43 @@ def test_advice_names_the_corner_of_the_picture_that_no_board_was_in():
     got = calibrate(BOARD, low, SIZE)
     assert any("top left" in text for text in got.advice)
     assert (got.coverage[0] == 0).all()
+
+
+PORT = FlatPort(0.08, 1.34)
+IN_AIR = np.array([[830.0, 0, 648.0], [0, 826.0, 471.0], [0, 0, 1]])
+BEHIND = {model: replace(LENS[model], K=IN_AIR, port=PORT) for model in LENS}
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+@pytest.mark.parametrize("guess", [PortGuess(0.08), PortGuess()], ids=["known distance", "estimated distance"])
+def test_exact_corners_behind_a_port_give_the_lens_and_the_port(model, guess):
+    views, _ = _views(BEHIND[model], np.random.default_rng(1), 16, 0.0)
+    got = calibrate(BOARD, views, SIZE, model, guess)
+    np.testing.assert_allclose(got.camera.K, IN_AIR, atol=2e-2)
+    np.testing.assert_allclose(got.camera.distortion, BEHIND[model].distortion, atol=1e-4)
+    assert got.camera.port.distance_m == pytest.approx(0.08, abs=1e-4)
+    assert got.held_out_px < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("draws", "low", "high"), [(10, 0.13, 3.0), pytest.param(50, 0.45, 1.75, marks=pytest.mark.slow)]
+)
+def test_the_stated_errors_behind_a_port_are_those_of_many_draws(draws, low, high):
+    """The same bounds as without a port."""
+    camera, chi2 = BEHIND["plumb_bob"], []
+    truth = np.array([830.0, 826.0, 648.0, 471.0, -0.21, 0.06, 8e-4, -5e-4, 0.08])
+    for seed in range(draws):
+        views, _ = _views(camera, np.random.default_rng(seed), 12, 0.2)
+        got = calibrate(BOARD, views, SIZE, port=PortGuess())
+        lens = [got.camera.focal_px, got.camera.center_px, got.camera.distortion[:4], [got.camera.port.distance_m]]
+        chi2.append(((np.concatenate(lens) - truth) / got.sigma[:9]) ** 2)
+    assert (np.mean(chi2, axis=0) > low).all()
+    assert (np.mean(chi2, axis=0) < high).all()
+
+
+def test_a_pinhole_cannot_say_what_a_port_does():
+    """The residual tells them apart: with the port it is the noise, without it is more."""
+    views, _ = _views(BEHIND["plumb_bob"], np.random.default_rng(3), 20, 0.1)
+    port, pinhole = (calibrate(BOARD, views, SIZE, port=guess) for guess in (PortGuess(), None))
+    assert port.rms_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.1)
+    assert pinhole.rms_px > 1.5 * port.rms_px

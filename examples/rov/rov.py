@@ -54,7 +54,7 @@ coding = {"tune": "zerolatency", "preset": "ultrafast", "g": "8", "crf": "16"}
 stream = video.add_stream("libx264", rate=FPS, options=coding)
 stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
 stream.codec_context.time_base = Fraction(1, 90_000)
-place, go, begun, now, said = None, 1, time.monotonic(), time.monotonic(), set()
+place, course, go, begun, now, said = None, motion.heading_rad, 1, time.monotonic(), time.monotonic(), set()
 while now - begun < MOST_S and server.poll() is None:
     frame = av.VideoFrame.from_ndarray(picture(), "bgr24")
     frame.pts, frame.time_base = int((now - begun) * 90_000), Fraction(1, 90_000)
@@ -62,25 +62,25 @@ while now - begun < MOST_S and server.poll() is None:
     until, answered = time.monotonic() + 1.0, False  # of this frame: a slow machine costs frames, not control
     while message := link.recv_match(blocking=not answered, timeout=max(0.01, until - time.monotonic())):
         if message.get_type() == "VISION_POSITION_ESTIMATE":  # forward, right, down
-            place = [message.x, message.y, message.z, message.yaw]
+            place, course = [message.x, message.y, message.z], motion.heading_rad + message.yaw
         elif message.get_type() == "NAMED_VALUE_INT" and message.name == "go_no_go":
             go, answered = message.value, True
         elif message.get_type() == "STATUSTEXT" and message.text not in said:
             said.add(message.text)
             print(f"{now - begun:6.1f} s  {message.text}", flush=True)
-    thrust, wanted = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
+    (surge, sway, heave), wanted = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     if place is not None:
         ahead = {2: limited(0.5 * (GOAL_M - place[0]), 0.5), 1: 0.0, 0: -0.3}[go]  # go, hold, abort
-        wanted = (ahead, limited(-0.5 * place[1], 0.2), limited(-0.5 * place[2], 0.2), limited(-0.5 * place[3], 0.2))
-        signs = (1.0, -1.0, -1.0, -1.0)  # the hull's axes are forward, left, up
-        thrust = tuple(body_drag(ROV, axis, sign * w) for axis, (w, sign) in enumerate(zip(wanted, signs, strict=True)))
+        wanted = (ahead, limited(-0.5 * place[1], 0.2), limited(-0.5 * place[2], 0.2))
+        surge, sway, heave = (body_drag(ROV, axis, sign * wanted[axis]) for axis, sign in enumerate((1.0, -1.0, -1.0)))
         if go == 2 and abs(GOAL_M - place[0]) < 0.1:
             break
     time.sleep(max(0.0, now + 1.0 / FPS - time.monotonic()))
     lapse, now = time.monotonic() - now, time.monotonic()
     place = place and [at + w * lapse for at, w in zip(place, wanted, strict=True)]  # reckoned until the next message
     for _ in range(max(1, round(lapse / 0.02))):
-        motion.step(thrust, (0.0, 0.0, 0.0), lapse / max(1, round(lapse / 0.02)))
+        yaw = 4.0 * (course - motion.heading_rad) - 3.0 * motion.through_water[3]  # the autopilot's own heading hold
+        motion.step((surge, sway, heave, yaw), (0.0, 0.0, 0.0), lapse / max(1, round(lapse / 0.02)))
 server.terminate()
 server.wait()
 miss = math.dist(motion.position, (GOAL_M, 0.0, 0.0))

@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from lumidock.camera import Camera, load_camera
     from lumidock.config import Config, PaperConfig, load_config
-    from lumidock.datatypes import Attitude, Detections, Fix, Frame, Guide, LayerPose, Match, Protection
+    from lumidock.datatypes import (
+        AidingMeasurement,
+        Attitude,
+        Detections,
+        Fix,
+        Frame,
+        Guide,
+        LayerPose,
+        Match,
+        Protection,
+        SensorUse,
+        Velocity,
+    )
     from lumidock.errors import DataError, FrameError, InputError, LumidockError
     from lumidock.localizer import Localizer
     from lumidock.paper import PaperLocalizer
@@ -17,6 +29,7 @@ if TYPE_CHECKING:
     from lumidock.station import Station, load_station
 
 __all__ = [
+    "AidingMeasurement",
     "Attitude",
     "Camera",
     "Config",
@@ -35,7 +48,9 @@ __all__ = [
     "PaperLocalizer",
     "PoseSolution",
     "Protection",
+    "SensorUse",
     "Station",
+    "Velocity",
     "load_camera",
     "load_config",
     "load_station",
@@ -45,7 +60,19 @@ __all__ = [
 _HOMES = {
     "camera": ("Camera", "load_camera"),
     "config": ("Config", "PaperConfig", "load_config"),
-    "datatypes": ("Attitude", "Detections", "Fix", "Frame", "Guide", "LayerPose", "Match", "Protection"),
+    "datatypes": (
+        "AidingMeasurement",
+        "Attitude",
+        "Detections",
+        "Fix",
+        "Frame",
+        "Guide",
+        "LayerPose",
+        "Match",
+        "Protection",
+        "SensorUse",
+        "Velocity",
+    ),
     "errors": ("DataError", "FrameError", "InputError", "LumidockError"),
     "localizer": ("Localizer",),
     "paper": ("PaperLocalizer",),

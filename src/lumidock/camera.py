@@ -6,7 +6,7 @@ the top-left pixel. What the lens model cannot see (behind the camera, beyond th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lumidock.datatypes import Array, require_shape
 from lumidock.errors import InputError
+from lumidock.port import FlatPort
 from lumidock.yamlfile import read_mapping, validate
 
 DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
@@ -34,18 +35,23 @@ _MODEL_NAMES: dict[str, tuple[str, ...]] = {
 _MODELS, _MAX_SIDE_PX = ", ".join(_COEFFICIENTS), 32768
 _FOLD_MARGIN, _FOLD_STEPS = 0.999, 10_000
 _NEWTON_STEPS = 40
+_FAR_M = 1e4  # where the place in the port that a ray crosses no longer matters
 _NEWTON_TOLERANCE, _NEWTON_ACCEPTED = 1e-10, 1e-9  # in normalised image units: 2e-7, 2e-6 px at f = 2000 px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """Image size, camera matrix `K` (3, 3) px and distortion coefficients in OpenCV's order."""
+    """Image size, camera matrix `K` (3, 3) px and distortion coefficients in OpenCV's order.
+
+    Behind a flat `port` they are those of the lens in air, and the origin of `cam` is its entrance pupil.
+    """
 
     width: int
     height: int
     K: Array
     model: DistortionModel = "plumb_bob"
     distortion: Array = field(default_factory=lambda: np.zeros(5))
+    port: FlatPort | None = None
     _pinhole: bool = field(init=False)
     _fold: float = field(init=False)  # where the lens model ends: normalised radius, or angle in rad
 
@@ -67,8 +73,8 @@ class Camera:
         return np.asarray(self.K[:2, 2])
 
     def lens(self) -> Array:
-        """The flat array (16,) that the kernels project with; see `_kernels.lens`."""
-        flat = np.zeros(16)
+        """The flat array (20,) that the kernels project with; see `_kernels.lens`."""
+        flat = np.zeros(20)
         flat[0] = self.model == "equidistant"
         flat[1:3], flat[3:5] = self.focal_px, self.center_px
         flat[5:8] = self._fold, self.width, self.height
@@ -77,6 +83,8 @@ class Camera:
         else:
             num, den, p1, p2 = _rational_terms(self.distortion)
             flat[8:16] = *num[1:], *den[1:], p1, p2
+        if self.port is not None:
+            flat[16:20] = self.port.distance_m, self.port.glass_m, self.port.glass_index, self.port.index
         return flat
 
     def contains(self, uv: Array, *, margin_px: float = 0.0) -> np.ndarray:
@@ -92,8 +100,15 @@ class Camera:
     def project_with_jacobian(self, p_cam: Array) -> tuple[Array, Array]:
         """Pixels `uv` (N, 2) and J_uv_p (N, 2, 3) px/m of points `p_cam` (N, 3).
 
-        Source: OpenCV "Camera Calibration and 3D Reconstruction"; J. Kannala, S. Brandt, 2006 (equidistant).
+        Source: OpenCV "Camera Calibration and 3D Reconstruction"; J. Kannala, S. Brandt, 2006 (equidistant); `port`.
         """
+        if self.port is None:
+            return self._lens_with_jacobian(p_cam)
+        xy, J_xy_p = self.port.in_air(p_cam)
+        uv, J_uv_air = self._lens_with_jacobian(np.column_stack([xy, np.ones(len(xy))]))
+        return uv, J_uv_air[:, :, :2] @ J_xy_p
+
+    def _lens_with_jacobian(self, p_cam: Array) -> tuple[Array, Array]:
         if self.model == "equidistant":
             xy, J = _distort_equidistant(p_cam, self.distortion, self._fold)
         else:
@@ -101,7 +116,14 @@ class Camera:
         return xy * self.focal_px + self.center_px, J * self.focal_px[:, None]
 
     def unproject(self, uv: Array) -> Array:
-        """Unit rays `ray_cam` (N, 3) of pixels `uv` (N, 2); NaN where no ray reaches the pixel."""
+        """Unit rays `ray_cam` (N, 3) of pixels `uv` (N, 2); NaN where no ray reaches the pixel.
+
+        Behind a port, the directions in the water; near the axis they meet `port.viewpoint_m` behind the origin.
+        """
+        ray = self._lens_rays(uv)
+        return ray if self.port is None else self.port.in_water(ray)
+
+    def _lens_rays(self, uv: Array) -> Array:
         xy = (uv - self.center_px) / self.focal_px
         if self._pinhole:
             ray = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
@@ -114,10 +136,11 @@ class Camera:
         """Unit rays `ray_cam` (N, 3) and J_ray_uv (N, 3, 2) 1/px of pixels `uv` (N, 2).
 
         Source: implicit function theorem on `project_with_jacobian`; a unit ray moves only across itself, so its
-        Jacobian is the pseudo-inverse of J_uv_p at unit distance.
+        Jacobian is the pseudo-inverse of J_uv_p at unit distance (behind a port, of a far point).
         """
         ray = self.unproject(uv)
-        _, J_uv_ray = self.project_with_jacobian(ray)
+        distance = 1.0 if self.port is None else _FAR_M
+        J_uv_ray = self.project_with_jacobian(distance * ray)[1] * distance
         J = np.full((len(uv), 3, 2), np.nan)
         good = np.isfinite(J_uv_ray).all(axis=(1, 2))
         J[good] = np.linalg.pinv(J_uv_ray[good])
@@ -279,6 +302,17 @@ class _Matrix(BaseModel):
     data: list[float]
 
 
+class _Port(BaseModel):
+    """A flat port, as `FlatPort` has it."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    kind: Literal["flat"]
+    distance_m: Annotated[float, Field(ge=0.0, le=1.0)]
+    index: Annotated[float, Field(ge=1.0, le=1.5)] = 1.34
+    glass_m: Annotated[float, Field(ge=0.0, le=0.2)] = 0.0
+    glass_index: Annotated[float, Field(ge=1.0, le=2.5)] = 1.5
+
+
 class _CameraInfo(BaseModel):
     """The part of ROS camera_info that lumidock reads; its other keys are let pass."""
 
@@ -291,6 +325,7 @@ class _CameraInfo(BaseModel):
     distortion_coefficients: _Matrix
     binning_x: Annotated[int, Field(ge=0)] = 0
     binning_y: Annotated[int, Field(ge=0)] = 0
+    port: _Port | None = None
 
 
 def load_camera(path: Path | str) -> Camera:
@@ -314,6 +349,9 @@ def camera_of_mapping(content: dict[str, Any], path: Path) -> Camera:
     model = info.distortion_model or info.camera_model or ""
     size = info.image_width, info.image_height
     camera = camera_from(str(path), size, info.camera_matrix.data, model, info.distortion_coefficients.data)
+    if info.port is not None:
+        values = info.port.model_dump(exclude={"kind"})
+        camera = replace(camera, port=FlatPort(**values))
     binning = max(info.binning_x, 1), max(info.binning_y, 1)
     return camera if binning == (1, 1) else binned(camera, binning)
 
@@ -340,7 +378,7 @@ def cropped(camera: Camera, offset: tuple[int, int], size: tuple[int, int]) -> C
 
 def replace_matrix(camera: Camera, size: tuple[int, int], K: Array) -> Camera:
     """The same lens before another sensor: `size` (width, height) px, `K` (3, 3) px."""
-    return Camera(*size, K, camera.model, camera.distortion)
+    return replace(camera, width=size[0], height=size[1], K=K)
 
 
 def lens_of(origin: str, model: str, coefficients: list[float]) -> tuple[DistortionModel, list[float]]:
@@ -413,7 +451,7 @@ def camera_from(origin: str, size: tuple[int, int], matrix: list[float], model: 
 
 
 def save_camera(camera: Camera, path: Path, *, name: str = "camera") -> None:
-    """Write a ROS camera_info YAML file."""
+    """Write a ROS camera_info YAML file, with the key `port` of lumidock for a camera behind a flat port."""
     fx, fy, cx, cy = (float(v) for v in (*camera.focal_px, *camera.center_px))
 
     def matrix(rows: int, cols: int, data: list[float]) -> dict[str, object]:
@@ -430,4 +468,6 @@ def save_camera(camera: Camera, path: Path, *, name: str = "camera") -> None:
         "rectification_matrix": matrix(3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
         "projection_matrix": matrix(3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
     }
+    if camera.port is not None:
+        content["port"] = {"kind": "flat", **asdict(camera.port)}
     path.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")

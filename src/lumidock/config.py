@@ -287,6 +287,8 @@ class IntegrityConfig(SettingsGroup):
     # prior probability that an associated light is wrong, until geometry has proven it
     fault: Annotated[float, Field(ge=1e-6, le=0.1)] = 1e-3
     fault_proven: Annotated[float, Field(ge=1e-7, le=0.1)] = 2e-6  # afterwards; as often as in nominal campaigns
+    # prior probability that a sensor of the vehicle is not as declared, until the lights have proven that it is
+    fault_sensor: Annotated[float, Field(ge=1e-6, le=0.1)] = 1e-2
     # log odds that meet the risk where too few lights check each other, -ln 1e-6
     evidence: Annotated[float, Field(ge=4.6, le=1e3)] = 13.8
     # frames in a row with four lights or more that agree, which meet it as well
@@ -297,6 +299,74 @@ class IntegrityConfig(SettingsGroup):
     max_age_s: Age = 0.3  # of the last detected light, up to which a fix is predicted
 
 
+Quaternion = tuple[float, float, float, float]
+Vector = tuple[float, float, float]
+
+
+class GyroConfig(SettingsGroup):
+    """The gyro: its mount and its errors, 1 sigma."""
+
+    quat_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)  # of R_cam_sensor: the axes of its values in `cam`
+    mount_sigma_deg: PositiveFloat = 2.0  # by which this is off
+    bias_deg_s: PositiveFloat = 0.3  # of an industrial MEMS gyro that was at rest once; a state of the filter
+    walk_deg_s: PositiveFloat = 0.01  # what a second adds to the bias
+    delay_s: Annotated[float, Field(ge=-2.0, le=2.0)] = 0.0  # by which its stamps are late
+    delay_sigma_s: PositiveFloat = 0.1
+
+
+class VelocityConfig(SettingsGroup):
+    """The DVL, with lock on a ground that does not move: its mount and its errors, 1 sigma."""
+
+    quat_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)  # of R_cam_sensor: the axes of its values in `cam`
+    position_m: Vector = (0.0, 0.0, 0.0)  # of its transducers in `cam`
+    mount_sigma_deg: PositiveFloat = 2.0  # by which the axes are off; a state of the filter
+    scale: PositiveFloat = (
+        0.03  # relative error, most of it of the speed of sound (1 % is 15 m/s); a state of the filter
+    )
+    walk: PositiveFloat = 0.0002  # what a second adds to both, relative and rad
+    delay_s: Annotated[float, Field(ge=-2.0, le=2.0)] = 0.0  # by which its stamps are late
+    delay_sigma_s: PositiveFloat = 0.1
+
+
+class DepthConfig(SettingsGroup):
+    """The depth sensor: its place and its errors, 1 sigma."""
+
+    position_m: Vector = (0.0, 0.0, 0.0)  # in `cam`
+    dock_depth_m: float = 0.0  # what it reads at the height of the dock's origin ...
+    dock_depth_sigma_m: PositiveFloat = 100.0  # ... and how well that is known; a state of the filter
+    walk_m: PositiveFloat = 0.005  # what a second adds to it: tide and waves
+    delay_s: Annotated[float, Field(ge=-2.0, le=2.0)] = 0.0  # by which its stamps are late
+
+
+class TiltConfig(SettingsGroup):
+    """The sensor of the direction upward: its mount. Its bias is held to be part of `dock_level_deg`."""
+
+    quat_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)  # of R_cam_sensor: the axes of its values in `cam`
+    delay_s: Annotated[float, Field(ge=-2.0, le=2.0)] = 0.0  # by which its stamps are late
+
+
+class DockMotionConfig(SettingsGroup):
+    """How a moored or hung dock moves about its mean place, 1 sigma; a dock on the ground does not."""
+
+    angle_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 0.0
+    rate_deg_s: Annotated[float, Field(ge=0.0, le=90.0)] = 0.0
+    position_m: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
+    velocity_m_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
+
+
+class AidingConfig(SettingsGroup):
+    """The vehicle's own sensors in the filter: what they are held to measure, and when they are believed."""
+
+    gyro: GyroConfig = GyroConfig()
+    velocity: VelocityConfig = VelocityConfig()
+    depth: DepthConfig = DepthConfig()
+    tilt: TiltConfig = TiltConfig()
+    dock_motion: DockMotionConfig = DockMotionConfig()
+    dock_level_deg: PositiveFloat = 3.0  # by which the dock's +y is off the vertical, as tilt and depth have it
+    group_s: Annotated[float, Field(ge=0.001, le=0.5)] = 0.1  # values of a sensor within it are applied as their mean
+    max_age_s: Age = 4.0  # of the last detected light, up to which a fix is predicted with gyro and velocity
+
+
 class Config(SettingsGroup):
     """All settings; saved with every run."""
 
@@ -305,6 +375,7 @@ class Config(SettingsGroup):
     match: MatchConfig = MatchConfig()
     track: TrackConfig = TrackConfig()
     integrity: IntegrityConfig = IntegrityConfig()
+    aiding: AidingConfig = AidingConfig()
     detect: DetectConfig = DetectConfig()
     label: LabelConfig = LabelConfig()
     methods: dict[str, dict[str, Any]] = {}  # settings of the methods that installed packages add, by their names

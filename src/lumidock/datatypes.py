@@ -22,6 +22,10 @@ MOSAICS = ("bayer_rggb", "bayer_bggr", "bayer_grbg", "bayer_gbrg")
 ENCODINGS = tuple(f"{kind}{bits}" for kind in ("mono", "bgr", *MOSAICS) for bits in (8, 16))
 SATURATED = 250.0  # of 255, in a picture that uses them all: from this grey level on samples tell no more light
 MatchSource = Literal["pso", "btekf"]
+SensorKind = Literal["gyro", "velocity", "depth", "tilt", "attitude"]
+SensorState = Literal["used", "proving", "silent", "declined"]
+SENSOR_VALUES: dict[SensorKind, int] = {"gyro": 3, "velocity": 3, "depth": 1, "tilt": 3, "attitude": 4}
+"""How many numbers a measurement of each kind has."""
 
 
 def require_shape(name: str, array: np.ndarray, *shape: int | None) -> None:
@@ -65,6 +69,36 @@ class Attitude:
         require_shape("R_dock_cam", self.R_dock_cam, 3, 3)
         if not (np.isfinite(self.R_dock_cam).all() and 0.0 < self.sigma_rad < np.inf):
             raise DataError("an attitude needs a finite rotation and a positive sigma_rad")
+
+
+@dataclass(frozen=True, slots=True)
+class AidingMeasurement:
+    """One value of a sensor of the vehicle, measured at `t_ns`, with its 1-sigma noise `sigma` on each number.
+
+    `kind` and `value`: `gyro`, rotation rate (3,) rad/s; `velocity`, velocity over ground (3,) m/s, as a DVL measures
+    it; `depth`, (1,) m below the surface; `tilt`, the direction upward (3,) of any length, which is what accelerometers
+    measure at rest, with `sigma` in rad; `attitude`, quat_xyzw (4,) of R_dock_cam, with `sigma` in rad. Vectors are in
+    the axes of the sensor, whose mount the settings `aiding` have; `sigma` is of noise that is independent from one
+    value to the next, and the settings have what is not.
+    """
+
+    kind: SensorKind
+    t_ns: int
+    value: tuple[float, ...]
+    sigma: float
+
+    def __post_init__(self) -> None:
+        require_stamp(self.t_ns)
+        wanted = SENSOR_VALUES.get(self.kind)
+        if wanted is None:
+            raise DataError(f"kind {self.kind!r}, wanted one of {', '.join(SENSOR_VALUES)}")
+        numbers = (*self.value, self.sigma)
+        if len(self.value) != wanted or not all(math.isfinite(number) for number in numbers):
+            raise DataError(f"{self.kind} has value {self.value}, wanted {wanted} finite numbers")
+        if not self.sigma > 0.0:
+            raise DataError(f"{self.kind} has sigma {self.sigma:g}, wanted a positive one")
+        if self.kind in ("tilt", "attitude") and not math.hypot(*self.value) > 1e-6:
+            raise DataError(f"{self.kind} has a value of no length")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,6 +249,41 @@ class Guide:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Velocity:
+    """The motion of `cam` in `dock`, in the axes of `cam`: `linear_m_s` (3,) and `angular_rad_s` (3,).
+
+    `covariance` (6, 6) of both, in this order. No protection level bounds it.
+    """
+
+    linear_m_s: Array
+    angular_rad_s: Array
+    covariance: Array
+
+    @property
+    def sigma(self) -> Array:
+        """1-sigma errors (6,): m/s, then rad/s."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance)))
+
+
+@dataclass(frozen=True, slots=True)
+class SensorUse:
+    """What the filter does with one of the vehicle's sensors.
+
+    `state`: `used`; `proving`: used too, while the protection levels still allow for its lying; `silent`: it has given
+    no value lately; `declined`: left out, for the `reason` bias (it contradicts its declared errors), noise (its noise
+    is larger than declared) or jumps (value after value is far from what the filter expects).
+    """
+
+    kind: SensorKind
+    state: SensorState
+    reason: str = ""
+
+    def __str__(self) -> str:
+        """As fixes.csv has it."""
+        return f"{self.kind}={self.state}" + (f":{self.reason}" if self.reason else "")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
     """A pose `T_dock_cam` (4, 4) that fits where none is proven, with its `probability` among those that fit."""
 
@@ -231,7 +300,8 @@ class Fix:
     innovation squared of a tracked frame over its degrees of freedom, 1 on average where noise is as stated; NaN
     without history. `n_seen` counts the frame's detections and `n_used` those behind the pose; `by_layer` holds what
     each layer's lights give alone, where a method works by layer. `alternatives`: the poses that fit while none is
-    proven, the likeliest first; never a fix.
+    proven, the likeliest first; never a fix. `velocity` comes with a pose or a guide from a method that knows it;
+    `aiding` says what became of each sensor that has given values.
     """
 
     frame: str
@@ -249,6 +319,8 @@ class Fix:
     guide: Guide | None = None
     nis: float = math.nan
     alternatives: tuple[Alternative, ...] = ()
+    velocity: Velocity | None = None
+    aiding: tuple[SensorUse, ...] = ()
 
     def __post_init__(self) -> None:
         if (self.T_dock_cam is None) != bool(self.reason):

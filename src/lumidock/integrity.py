@@ -10,9 +10,21 @@ from functools import cache
 import numpy as np
 
 from lumidock._kernels.tracking.levels import Groups, SigmaFactors, protection_levels
+from lumidock._kernels.tracking.track import TWIST
 from lumidock.alert_limits import AlertLimits
 from lumidock.config import IntegrityConfig
-from lumidock.datatypes import Alternative, Array, Detections, Fix, Guide, Match, Protection, Stage, Status
+from lumidock.datatypes import (
+    Alternative,
+    Array,
+    Detections,
+    Fix,
+    Guide,
+    Match,
+    Protection,
+    Stage,
+    Status,
+    Velocity,
+)
 from lumidock.geometry import se3_inverse
 from lumidock.model import StationModel, light_of
 from lumidock.state import Context, LocalizerState
@@ -85,7 +97,8 @@ def fault_factors(n_lights: int, config: IntegrityConfig) -> SigmaFactors:
     def of(prior: float) -> Array:
         return sigma_factors(min(config.risk / (prior * max(n_lights, 1)), _COIN))
 
-    return SigmaFactors(sigma_factors(config.risk), of(config.fault), of(config.fault_proven))
+    sensor = sigma_factors(min(config.risk / config.fault_sensor, _COIN))
+    return SigmaFactors(sigma_factors(config.risk), of(config.fault), of(config.fault_proven), sensor)
 
 
 @cache
@@ -152,7 +165,7 @@ def assess(
 ) -> tuple[Fix, LocalizerState]:
     """The fix of the likeliest hypothesis as far as it can be trusted, and the state with its docking stage."""
     first, config = state.first, context.config.integrity
-    if status == "coasting" and (reason := _why_no_coasting(first, detections.t_ns, config)):
+    if status == "coasting" and (reason := _why_no_coasting(state, detections.t_ns, context)):
         return no_fix(state, detections, status, reason), state
     bound = bounds(state.hypotheses, context.model, config)
     doubt, limits = _doubt(state, context), context.station.alert_limits
@@ -174,8 +187,15 @@ def assess(
         guide=bound.guide if not doubt and guide_holds(bound, limits) else None,
         nis=first.last.nis / (2 * used) if status == "tracking" else math.nan,
         alternatives=alternatives(state.hypotheses) if doubt in _OPEN else (),
+        aiding=state.aiding.uses(detections.t_ns),
     )
-    return fix, state
+    return (replace(fix, velocity=velocity(first)) if fix.valid or fix.guide else fix), state
+
+
+def velocity(track: Track) -> Velocity:
+    """The motion of `cam` as a track has it."""
+    x, both = track.state.x, slice(TWIST, TWIST + 6)
+    return Velocity(x[TWIST : TWIST + 3].copy(), x[TWIST + 3 : TWIST + 6].copy(), track.state.P[both, both].copy())
 
 
 def alternatives(tracks: Sequence[Track]) -> tuple[Alternative, ...]:
@@ -195,19 +215,24 @@ def _doubt(state: LocalizerState, context: Context) -> str:
         return "ambiguous" if any(contradict(first.last.assignment, r.last.assignment) for r in rivals) else "unproven"
     if state.twin:
         return "ambiguous"
-    if state.thin_frames >= config.thin_frames:
+    # in the dark nothing can take over a track that the vehicle's own sensors carry; the first lights are checked
+    dark = state.dark_frames if state.aiding.carries(first.t_ns) else 0
+    if state.thin_frames - dark >= config.thin_frames:
         return "unproven"
     return contradicted_file(first, context.prior_var)[0]
 
 
-def _why_no_coasting(first: Track, t_ns: int, config: IntegrityConfig) -> str:
+def _why_no_coasting(state: LocalizerState, t_ns: int, context: Context) -> str:
     """The word for a track that no light fits in this frame and that may not be used without one, or nothing.
 
-    A failed test ends trust at once, a dark frame when the last light is too old.
+    A failed test ends trust at once, a dark frame when the last light is too old: later where the vehicle's own sensors
+    carry the track.
     """
+    first, config = state.first, context.config
     if first.agreeing_frames == 0:  # nothing has agreed since a test failed, or for too long
         return "residual"
-    return "stale" if (t_ns - first.seen.light_ns) * 1e-9 > config.max_age_s else ""
+    most_s = config.aiding.max_age_s if state.aiding.carries(t_ns) else config.integrity.max_age_s
+    return "stale" if (t_ns - first.seen.light_ns) * 1e-9 > most_s else ""
 
 
 def no_fix(state: LocalizerState, detections: Detections, status: Status, reason: str) -> Fix:
@@ -215,4 +240,14 @@ def no_fix(state: LocalizerState, detections: Detections, status: Status, reason
     spurious = Match(detections, np.full(len(detections), -1, np.int64))
     frame, t_ns, seen = detections.frame, detections.t_ns, len(detections)
     poses = alternatives(state.hypotheses) if reason in _OPEN else ()
-    return Fix(frame, t_ns, status, state.stage, n_seen=seen, reason=reason, match=spurious, alternatives=poses)
+    return Fix(
+        frame,
+        t_ns,
+        status,
+        state.stage,
+        n_seen=seen,
+        reason=reason,
+        match=spurious,
+        alternatives=poses,
+        aiding=state.aiding.uses(t_ns),
+    )

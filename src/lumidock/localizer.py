@@ -14,7 +14,7 @@ from lumidock import acquisition, detect, integrity, layers, tracking, verify
 from lumidock.acquisition import Moment
 from lumidock.camera import Camera
 from lumidock.config import Config
-from lumidock.datatypes import Array, Detections, Fix, Frame
+from lumidock.datatypes import AidingMeasurement, Array, Detections, Fix, Frame
 from lumidock.errors import FrameError, InputError
 from lumidock.light_counts import CHECKED_LIGHTS, MAX_DETECTIONS, MAX_LIGHTS, POSE_LIGHTS
 from lumidock.match import Acquisition
@@ -43,6 +43,13 @@ class Localizer:
         self.state = LocalizerState()
         if self.scan is not None:
             self.scan.forget()
+
+    def aid(self, measurement: AidingMeasurement) -> None:
+        """Give a value of one of the vehicle's sensors; it counts from the next frame on, at the time it was measured.
+
+        Values may come in any order and at any rate; one that belongs before a frame should come before that frame.
+        """
+        self.state = replace(self.state, aiding=self.state.aiding.with_value(measurement))
 
     def process(self, frame: Frame) -> Fix:
         """The fix of one frame's image. Raises: FrameError when the image is not of the camera's size."""
@@ -80,7 +87,7 @@ def step(
     refused = _why_refused(state.last, detections)
     if refused == "bad_stamp":
         return integrity.no_fix(state, detections, "none", refused), replace(state, last=detections)
-    predicted = predicted.with_attitude(detections.attitude)
+    state, predicted = replace(state, aiding=predicted.aiding), predicted.with_attitude(detections.attitude)
     frame = measurements(detections, context.model, context.config.match)
     refused = refused or ("frozen" if tracking.is_frozen(state, predicted, frame, context) else "")
     state = replace(_arrived(state, detections, predicted, context), frozen=refused == "frozen")
@@ -114,6 +121,8 @@ def _arrived(state: LocalizerState, detections: Detections, predicted: Predictio
     calibration = state.calibration
     if state.confirmed and state.first.estimates_calibration:
         calibration = learned_calibration(state.first)
+    if predicted.deceived:  # what a track has learned from a sensor that lies is wrong too
+        calibration = None
     return replace(state, last=detections, hypotheses=(), confirmed=False, calibration=calibration)
 
 
@@ -122,7 +131,7 @@ def _tracked(
 ) -> tuple[Fix, LocalizerState]:
     """A confirmed track holds; where it may overlook a layer, the frame is acquired anew to compare."""
     context = moment.context
-    tracked = _checked(replace(state, hypotheses=tuple(followed), failures=0), moment)
+    tracked = _checked(replace(state, hypotheses=tuple(followed), failures=0, dark_frames=0), moment)
     if not tracking.overlooks(followed[0], moment.frame, context):
         return integrity.assess(tracked, detections, "tracking", context)
     found = moment.acquire()
@@ -160,7 +169,8 @@ def _lost(
     state: LocalizerState, followed: Sequence[Track], detections: Detections, moment: Moment
 ) -> tuple[Fix, LocalizerState]:
     """No confirmed track holds: the frame is acquired, unless it is the first to fail its test after one that held."""
-    doubt = _doubt(followed, moment)
+    doubt, dark = _doubt(followed, moment), not followed and count_lamps(moment.frame) < CHECKED_LIGHTS
+    state = replace(state, dark_frames=state.dark_frames + 1 if dark else 0)
     if state.confirmed and doubt == "residual" and state.failures == 1:  # one in many thousands fails by chance
         return _coasting(state, detections, moment.context, doubt)
     return _acquired(state, followed, detections, moment, moment.acquire(), doubt=doubt)

@@ -11,14 +11,14 @@ from typing import Any, Protocol, runtime_checkable
 
 from lumidock.camera import Camera
 from lumidock.config import Config
-from lumidock.datatypes import Detections, Fix, Frame
+from lumidock.datatypes import AidingMeasurement, Detections, Fix, Frame
 from lumidock.errors import InputError
 from lumidock.localizer import Localizer
 from lumidock.paper import PaperLocalizer
 from lumidock.station import Station
 
 METHODS = ("lumidock", "paper")
-BASELINES = ("hungarian", "plain-pso", "p3p-vote", "p3p-neighbours", "ransac-p3p", "cpd")
+BASELINES = ("hungarian", "plain-pso", "p3p-vote", "p3p-neighbours", "ransac-p3p", "cpd", "learned")
 GROUP = "lumidock.methods"  # of entry points: NAME = "package.module:factory", a factory as in `Factory`
 
 
@@ -36,6 +36,15 @@ class Method(Protocol):
 
     def forget(self) -> None:
         """Begin anew, without history."""
+        ...
+
+
+@runtime_checkable
+class Aided(Protocol):
+    """What a method offers too that makes use of the vehicle's own sensors."""
+
+    def aid(self, measurement: AidingMeasurement) -> None:
+        """One value of one sensor, before the frames that it helps."""
         ...
 
 

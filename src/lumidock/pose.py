@@ -57,6 +57,8 @@ def sqpnp(camera: Camera, p_dock: Array, uv: Array) -> Array | None:
     T_cam_dock = np.eye(4)
     T_cam_dock[:3, :3] = so3_exp(np.asarray(rvec, float).ravel())
     T_cam_dock[:3, 3] = np.asarray(tvec, float).ravel()
+    if camera.port is not None:
+        T_cam_dock[2, 3] -= camera.port.viewpoint_m  # where the rays near the axis meet
     in_front = transform_points(T_cam_dock, p_dock)[:, 2] > 0.0
     return se3_inverse(T_cam_dock) if in_front.all() else None
 

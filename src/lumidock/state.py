@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lumidock.aiding import NO_AIDING, AidingState
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Detections, Stage
@@ -44,7 +45,8 @@ class LocalizerState:
     `thin_frames`: frames in a row, up to the last that was checked, in which fewer than four lights held the track.
     `twin`: another array of the same layout was in view. `frozen`: the last frame was the picture before it again.
     `failures`: frames since the first hypothesis last held. `stage`: docking stage of the last fix. `last`: detections
-    of the frame before. `calibration`: what an earlier track has learned of survey and calibration.
+    of the frame before. `calibration`: what an earlier track has learned of survey and calibration. `aiding`: the
+    vehicle's own sensors. `dark_frames`: frames in a row in which no light held the track.
     """
 
     hypotheses: tuple[Track, ...] = ()
@@ -57,6 +59,8 @@ class LocalizerState:
     stage: Stage = "search"
     last: Detections | None = None
     calibration: CalibrationStates | None = None
+    aiding: AidingState = NO_AIDING
+    dark_frames: int = 0
 
     @property
     def first(self) -> Track:

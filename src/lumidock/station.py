@@ -169,7 +169,8 @@ class _StationFile(_Strict):
         for i, j in np.argwhere(np.triu(gaps < _MIN_SPACING_M, k=1))[:1]:
             raise ValueError(f"lights {ids[i]} and {ids[j]} stand at the same position")
         if not _MIN_EXTENT_M <= gaps.max() <= _MAX_EXTENT_M:
-            raise ValueError(f"extent of {gaps.max():.3g} m is outside {_MIN_EXTENT_M}-{_MAX_EXTENT_M:.0f} m")
+            extent = f"extent of {gaps.max():.3g} m is outside {_MIN_EXTENT_M}-{_MAX_EXTENT_M:.0f} m"
+            raise ValueError(extent + "; positions are in metres" * bool(gaps.max() > _MAX_EXTENT_M))
         return self
 
 

@@ -34,6 +34,7 @@ _SAME_SIGMA = 0.1  # poses nearer than this are one
 _NEVER = -(2**62)  # ns
 _MAX_FLATTENINGS, _FLATTENED = 12, 1.02  # the flatter the view, the wider the tilt it leaves, until it grows no more
 _WINDOW_MARGIN_PX, _MAX_REACH_PX = 8.0, 200.0  # of a search window: room for the blob; no larger than a full search
+SENSORS = 4  # of the vehicle, to each of which one state of an aided track's bank is blind
 NO_PLANE = np.full(6, np.nan)
 
 
@@ -143,9 +144,13 @@ def learned_calibration(track: Track) -> CalibrationStates:
     return CalibrationStates(x, P)
 
 
-def open_bank(model: StationModel) -> Bank:
-    """A bank in which no subset has begun."""
-    S, m, n = int(model.group.max()) + 1, len(model), kernel.LIGHTS + 3 * len(model)
+def open_bank(model: StationModel, states: int = 0, sensors: int = 0) -> Bank:
+    """A bank in which no subset has begun, of so many `states`, by default as many as the station needs.
+
+    Behind the subsets that are blind to lights it has one for each of some `sensors`.
+    """
+    m = len(model)
+    S, n = int(model.group.max()) + 1 + sensors, states or kernel.LIGHTS + 3 * m
     none, nobody = np.full(S, -1, np.int64), np.zeros(m, np.int64)
     return Bank(
         np.zeros((S, n)),
@@ -156,6 +161,12 @@ def open_bank(model: StationModel) -> Bank:
         seen=nobody,
         proven=nobody,
     )
+
+
+def _open_bank_of(state: FilterState, model: StationModel) -> Bank:
+    """An open bank of as many states as the filter has; error states of sensors are those beyond the station's."""
+    n = len(state.x)
+    return open_bank(model, n, SENSORS if n > kernel.LIGHTS + 3 * len(model) else 0)
 
 
 def _copied(bank: Bank) -> Bank:
@@ -193,7 +204,7 @@ def start(
     kernel.attitude_update(state, prior.R_dock_cam, 1.0 / prior.info, prior.measured)
     never = LastSeen(t_ns, _NEVER, (_NEVER,) * model.n_layers)
     nothing = FrameResult.nothing(model)
-    fresh = Track(t_ns, t_ns, state, open_bank(model), never, nothing, log_weight=hypothesis.log_evidence)
+    fresh = Track(t_ns, t_ns, state, _open_bank_of(state, model), never, nothing, log_weight=hypothesis.log_evidence)
     first = _Start(hypothesis.R, hypothesis.t, None)
     begun = _update(fresh, hypothesis.assignment, frame, model, config, guess=first)
     for _ in range(_MAX_FLATTENINGS):
@@ -207,14 +218,26 @@ def start(
     return None if begun is None else _bank_updated(fresh, begun, frame, model, config, starting=True)
 
 
-def predict(track: Track, t_ns: int, config: TrackConfig) -> Track:
-    """The track at a later time, its twist held but for white noise on it; what agreed too long ago counts no more."""
+def predict(
+    track: Track,
+    t_ns: int,
+    config: TrackConfig,
+    *,
+    dock_noise: tuple[float, float] = (0.0, 0.0),
+    max_gap_s: float | None = None,
+) -> Track:
+    """The track at a later time, in arrays of its own, its twist held but for white noise on it.
+
+    `dock_noise`: (m/s)^2/s and (rad/s)^2/s that the dock's own motion adds. What agreed longer ago than `max_gap_s`,
+    by default the configured gap, counts no more.
+    """
     R, t, x, P = track.state
-    state = FilterState(R.copy(), t.copy(), x, P.copy())
-    bank, dt, q = _copied(track.bank), (t_ns - track.t_ns) * 1e-9, (config.accel_m_s2**2, config.accel_rad_s2**2)
+    state = FilterState(R.copy(), t.copy(), x.copy(), P.copy())
+    bank, dt = _copied(track.bank), (t_ns - track.t_ns) * 1e-9
+    q = config.accel_m_s2**2 + dock_noise[0], config.accel_rad_s2**2 + dock_noise[1]
     kernel.predict(state, dt, *q)
     bank_kernel.predict_bank(bank, state, dt, *q)
-    lately = t_ns - track.seen.agreed_ns <= config.max_gap_s * 1e9
+    lately = t_ns - track.seen.agreed_ns <= (config.max_gap_s if max_gap_s is None else max_gap_s) * 1e9
     return Track(
         t_ns=t_ns,
         began_ns=track.began_ns,
@@ -384,7 +407,7 @@ def _update(
     if not math.isfinite(nis):
         return None
     # a pose of which nothing was known takes up six of the pixels' degrees of freedom
-    deviate = _deviate(nis, 2 * sum(count) - (6 if guess else 0))
+    deviate = deviate_of(nis, 2 * sum(count) - (6 if guess else 0))
     result = FrameResult(assignment, count, plane, nis, deviate)
     seen_now = _seen(track, count)
     return Track(
@@ -397,7 +420,7 @@ def _update(
         estimates_calibration=both,
         log_weight=track.log_weight + log_evidence,
         agreeing_frames=track.agreeing_frames + int(seen_now.agreed_ns == track.t_ns),
-        mean_deviate=_mean(track.mean_deviate, deviate, config.deviate_memory),
+        mean_deviate=mean_of(track.mean_deviate, deviate, config.deviate_memory),
     )
 
 
@@ -409,12 +432,12 @@ def _seen(track: Track, count: tuple[int, ...]) -> LastSeen:
     return LastSeen(t_ns, t_ns if sum(count) >= CHECKED_LIGHTS else seen.agreed_ns, layer_ns)
 
 
-def _mean(before: float, deviate: float, memory: float) -> float:
+def mean_of(before: float, deviate: float, memory: float) -> float:
     """The exponential mean of normal deviates, scaled so that its variance is one as well."""
     return memory * before + math.sqrt(1.0 - memory**2) * deviate
 
 
-def _deviate(square: float, dof: int) -> float:
+def deviate_of(square: float, dof: int) -> float:
     """A chi-square value as a standard normal deviate, 0 without freedom. Source: E. Wilson, M. Hilferty, 1931."""
     if dof <= 0:
         return 0.0

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lumidock import track, verify
+from lumidock import aiding, track, verify
 from lumidock._kernels.measurements import Measurements
 from lumidock._kernels.tracking.track import PredictedMeasurements
+from lumidock.aiding import NO_AIDING, AidingState
 from lumidock.datatypes import Array, Attitude
 from lumidock.light_counts import CHECKED_LIGHTS
 from lumidock.model import count_lamps
@@ -23,12 +24,15 @@ class Prediction:
     """The hypotheses of a state at `t_ns`, the time of the next frame.
 
     `tracks`: those that have seen a light lately. `measurements`: where the first of them expects its lights, while it
-    is being tracked; None: nothing is expected, and a frame has to be searched in full.
+    is being tracked; None: nothing is expected, and a frame has to be searched in full. `aiding`: what is known of the
+    vehicle's sensors then; `deceived`: one of them lied to the tracks, and none of them is left.
     """
 
     t_ns: int
     tracks: tuple[Track, ...]
     measurements: PredictedMeasurements | None
+    aiding: AidingState = NO_AIDING
+    deceived: bool = False
 
     def windows(self) -> Array | None:
         """Where a detector has to look: (n, 3) u, v and reach px; None: everywhere."""
@@ -39,17 +43,23 @@ class Prediction:
         if attitude is None:
             return self
         tracks = tuple(track.update_attitude(one, attitude) for one in self.tracks)
-        return Prediction(self.t_ns, tracks, None)
+        return replace(self, tracks=tracks, measurements=None)
 
 
 def predict(state: LocalizerState, t_ns: int, context: Context) -> Prediction:
-    """The hypotheses at the time of a frame; those without lights for too long, or from the future, are dropped."""
-    config = context.config.track
-    alive = [one for one in state.hypotheses if one.t_ns < t_ns <= one.seen.light_ns + config.max_gap_s * 1e9]
-    tracks = tuple(track.predict(one, t_ns, config) for one in alive)
-    if not alive or alive[0] is not state.first or not _is_tracked(state, t_ns):
-        return Prediction(t_ns, tracks, None)
-    return Prediction(t_ns, tracks, track.predict_measurements(tracks[0], context.model))
+    """The hypotheses at the time of a frame; those without lights for too long, or from the future, are dropped.
+
+    On the way to it they are updated by what the vehicle's sensors have measured since the frame before.
+    """
+    gap_s = aiding.max_gap_s(state.aiding, state.first.t_ns if state.hypotheses else t_ns, context.config)
+    alive = [one for one in state.hypotheses if one.t_ns < t_ns <= one.seen.light_ns + gap_s * 1e9]
+    followed = state.confirmed and bool(alive) and alive[0] is state.first
+    tracks, sensors, deceived = aiding.advance(
+        alive, state.aiding, t_ns, context.model, context.config, confirmed=followed
+    )
+    if not tracks or not followed or not _is_tracked(state, t_ns):
+        return Prediction(t_ns, tracks, None, sensors, deceived)
+    return Prediction(t_ns, tracks, track.predict_measurements(tracks[0], context.model), sensors)
 
 
 def _is_tracked(state: LocalizerState, t_ns: int) -> bool:

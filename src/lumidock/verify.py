@@ -111,8 +111,8 @@ def contradicted_file(track: Track, prior_var: Array) -> tuple[str, int]:
     """
     if not track.estimates_calibration:
         return "", -1
-    x, var = track.state.x[CALIBRATION:], np.diagonal(track.state.P)[CALIBRATION:]
-    prior = prior_var[CALIBRATION:]
+    own = slice(CALIBRATION, len(prior_var))
+    x, var, prior = track.state.x[own], np.diagonal(track.state.P)[own], prior_var[own]
     told = prior - var
     test = np.where(told > _TOLD_SHARE * prior, x**2 / np.maximum(told, 1e-300), 0.0)
     worst = int(test.argmax())

@@ -125,7 +125,8 @@ def validate(model: type[Model], content: dict[str, Any], origin: str) -> Model:
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        first = error.errors()[0]
+        # an unknown key first: what is missing is often what it should have been
+        first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
         place = " ".join(".".join(str(part) for part in first["loc"] if not str(part).startswith("_")).split())
         message = first["msg"].removeprefix("Value error, ")
         if first["type"] == "extra_forbidden":

@@ -1,7 +1,8 @@
 """Projection of one point with its Jacobian, and small dense linear algebra, for the other kernels.
 
-A lens is a flat array (16,): model (0 rational, 1 equidistant), fx, fy, cx, cy, fold, width, height, then k1, k2, k3,
-k4, k5, k6, p1, p2 of the rational model or k1..k4 of the equidistant one.
+A lens is a flat array (20,): model (0 rational, 1 equidistant), fx, fy, cx, cy, fold, width, height, then k1, k2, k3,
+k4, k5, k6, p1, p2 of the rational model or k1..k4 of the equidistant one, then of a flat port (`lumidock.port`) the
+distance, the thickness and index of the glass, and the index of the water, which is 0 where there is no port.
 """
 
 from __future__ import annotations
@@ -12,6 +13,9 @@ import numpy as np
 
 from lumidock._kernels.compiling import part
 from lumidock.datatypes import Array, Indices
+
+_STEEPEST = 20.0  # as `port.STEEPEST`
+_PORT_STEPS, _PORT_TOLERANCE = 30, 1e-13  # of Newton's method, which needs three to six; relative
 
 Projection = tuple[bool, float, float, float, float, float, float, float, float]
 
@@ -24,6 +28,54 @@ def _unseen() -> Projection:
 @part
 def project(lens: Array, x: float, y: float, z: float) -> Projection:
     """Whether the lens sees a point in `cam`, its pixel u, v, and the rows du/d(x, y, z), dv/d(x, y, z) px/m."""
+    if lens[19] > 0.0:
+        return _project_behind_port(lens, x, y, z)
+    return _project_in_air(lens, x, y, z)
+
+
+@part
+def _project_behind_port(lens: Array, x: float, y: float, z: float) -> Projection:
+    """`FlatPort.in_air`, and the lens in air behind it."""
+    depth = z - lens[16] - lens[17]
+    if not depth > 0.0:
+        return _unseen()
+    r = math.sqrt(x * x + y * y)
+    a = r / (lens[16] + lens[17] / lens[18] + depth / lens[19])
+    slope = 1.0
+    for _ in range(_PORT_STEPS):
+        water = lens[19] ** 2 + (lens[19] ** 2 - 1.0) * a * a
+        glass = lens[18] ** 2 + (lens[18] ** 2 - 1.0) * a * a
+        in_water, in_glass = 1.0 / math.sqrt(water), 1.0 / math.sqrt(glass)
+        slope = lens[16] + lens[17] * lens[18] ** 2 * in_glass / glass + depth * lens[19] ** 2 * in_water / water
+        step = (r - a * (lens[16] + lens[17] * in_glass + depth * in_water)) / slope
+        if step <= _PORT_TOLERANCE * a:
+            break
+        a += step
+        if a > _STEEPEST:
+            return _unseen()
+    scale, cx, cy = 1.0 / slope, 0.0, 0.0
+    if r > 0.0:
+        scale, cx, cy = a / r, x / r, y / r
+    seen, u, v, uu, uv, _, vu, vv, _ = _project_in_air(lens, cx * a, cy * a, 1.0)
+    radial = 1.0 / slope - scale
+    xx, xy, yy = scale + radial * cx * cx, radial * cx * cy, scale + radial * cy * cy
+    along = -a / math.sqrt(lens[19] ** 2 + (lens[19] ** 2 - 1.0) * a * a) / slope
+    xz, yz = along * cx, along * cy
+    return (
+        seen,
+        u,
+        v,
+        uu * xx + uv * xy,
+        uu * xy + uv * yy,
+        uu * xz + uv * yz,
+        vu * xx + vv * xy,
+        vu * xy + vv * yy,
+        vu * xz + vv * yz,
+    )
+
+
+@part
+def _project_in_air(lens: Array, x: float, y: float, z: float) -> Projection:
     if lens[0] == 1.0:
         return _project_equidistant(lens, x, y, z)
     if not z > 0.0:

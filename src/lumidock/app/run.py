@@ -16,8 +16,9 @@ import numpy as np
 from lumidock.config import Config
 from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import FrameError, InputError
-from lumidock.methods import Method
+from lumidock.methods import Aided, Method
 from lumidock.streams.run_folder import RunFolder, identities
+from lumidock.streams.sensors import AidingFeed
 from lumidock.streams.source import Item, Source
 
 
@@ -99,11 +100,12 @@ def run(
 
     Raises: InputError when not one row could be used.
     """
-    summary, identity = Summary(), _identity(source, setup)
+    summary, identity, feed = Summary(), _identity(source, setup), AidingFeed(source.sensors())
     folder.describe(identity | {"counts": summary.as_dict()})
     stage: Stage = "search"
     try:
         for item in source.items(size):
+            aid(localizer, feed, item)
             fix, latency_us, error = process(localizer, item, "search" if setup.cold else stage)
             stage = fix.stage
             folder.add(fix, latency_us, t_ns=item.t_ns)
@@ -116,6 +118,13 @@ def run(
     if not summary.usable:
         raise InputError(summary.first_error or f"{source.path}: no frame in it")
     return summary
+
+
+def aid(localizer: Method, feed: AidingFeed, item: Item) -> None:
+    """Give a method that makes use of them what the vehicle's sensors have said until an item."""
+    if isinstance(localizer, Aided):
+        for value in feed.until(item.t_ns):
+            localizer.aid(value)
 
 
 def process(localizer: Method, item: Item, stage: Stage) -> tuple[Fix, int | None, str]:

@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from lumidock.app.run import process
+from lumidock.app.run import aid, process
 from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import LumidockError
 from lumidock.go_no_go import Watch
 from lumidock.methods import Method
+from lumidock.streams.sensors import AidingFeed
 from lumidock.streams.sinks import Sink
 from lumidock.streams.source import Item
 
@@ -259,6 +260,7 @@ class Server:
     arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
     latency_us: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
     last: Fix | None = None
+    feed: AidingFeed = field(default_factory=lambda: AidingFeed(()))
     watch: Watch | None = None  # of the go / no-go
     started_s: float = field(default_factory=time.monotonic)
 
@@ -288,6 +290,7 @@ class Server:
             gc.unfreeze()
 
     def _localize(self, taken: Taken, stage: Stage) -> Stage:
+        aid(self.localizer, self.feed, taken.item)
         fix, latency_us, _ = process(self.localizer, taken.item, stage)
         for worker in self.workers:
             worker.offer(Done(taken, fix, latency_us))

@@ -1,6 +1,6 @@
 """Other people's methods, written anew from their papers, on the same detections and behind the same two entries."""
 
-from lumidock.baselines import cpd, hungarian, neighbours, plain_pso, ransac, vote
+from lumidock.baselines import cpd, hungarian, learned, neighbours, plain_pso, ransac, vote
 from lumidock.baselines.localizer import BaselineLocalizer
 from lumidock.baselines.view import Associate
 
@@ -11,6 +11,7 @@ ASSOCIATIONS: dict[str, Associate] = {
     "p3p-neighbours": neighbours.associate,
     "ransac-p3p": ransac.associate,
     "cpd": cpd.associate,
+    "learned": learned.associate,
 }
 
 __all__ = ["ASSOCIATIONS", "BaselineLocalizer"]

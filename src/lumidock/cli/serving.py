@@ -56,6 +56,7 @@ from lumidock.go_no_go import DRIFT_M_S, Passage, Watch
 from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
+from lumidock.streams.sensors import AidingFeed
 from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, open_rerun
 from lumidock.streams.source import Reading, Source
 from lumidock.streams.vehicle import load_vehicle
@@ -197,7 +198,7 @@ def _server(opened: Source, localizer: methods.Method, lens: Camera, sinks: list
     stop, newest = threading.Event(), Newest()
     read = partial(opened.items, (lens.width, lens.height))
     reader = SourceReader(read, newest, live=opened.live, loop=loop, stop=stop)
-    return Server(localizer, reader, newest, sinks, stop)
+    return Server(localizer, reader, newest, sinks, stop, feed=AidingFeed(opened.sensors()))
 
 
 def _print_counts(server: Server, as_json: bool) -> None:

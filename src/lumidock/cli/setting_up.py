@@ -200,7 +200,7 @@ def _recordings(
             opened = open_any(source, Reading(fps))
             own = calibration_of(camera, opened).camera
             recordings.append(detections_of_items(opened.items(), drawing, own, settings))
-        if lens is not None and not (np.array_equal(lens.K, own.K) and np.array_equal(lens.distortion, own.distortion)):
+        if lens is not None and not np.array_equal(lens.lens(), own.lens()):
             raise InputError(f"{source}: its camera differs from that of {sources[0]}; survey with one camera")
         lens = own
     assert lens is not None

@@ -39,6 +39,7 @@ _MAX_SEED = 10**9
 _MAX_DELAY_MS = 10_000.0  # no camera on a vehicle is later
 SIM = "sim:"
 DEFAULT_STATION, DEFAULT_CAMERA = "cage-2x2x5", "imx264-60deg"
+_TELLING = 0.02  # share of the items after which the rate tells the time that remains: the first ones may compile code
 PLAIN_EVERY_S = 10.0  # between two lines of progress where there is no terminal
 _SIMULATED = (
     "frames",
@@ -354,7 +355,7 @@ class _PlainProgress:
         self._next_s = now + PLAIN_EVERY_S
         line = f"{self._title}: {done}{f' of {total}' if total else ''}, elapsed {duration(now - self._start_s)}"
         first_s, first_done = self._first
-        if total and done > first_done:
+        if total and done - first_done > _TELLING * total:
             line += f", remaining about {duration((now - first_s) * (total - done) / (done - first_done))}"
         print(line, file=sys.stderr, flush=True)
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import numpy as np
 import typer
 
-from lumidock.camera import Camera, load_camera, save_camera
+from lumidock.camera import load_camera, save_camera
 from lumidock.cli.calibration import calib
 from lumidock.cli.shared import AsJson, Force, Fps, example, open_any, progress_bar, require_new, shipped_or_path
 from lumidock.config import Config
@@ -45,6 +45,13 @@ def _water(
     model: Annotated[
         str, typer.Option(metavar="MODEL", help="plumb_bob, or equidistant for a wide lens.")
     ] = "plumb_bob",
+    port: Annotated[
+        str | None,
+        typer.Option(metavar="M|estimate", help="Flat port: distance from the entrance pupil to the water, m."),
+    ] = None,
+    water_index: Annotated[
+        str, typer.Option(metavar="N|estimate", help="Refractive index of the water, with --port.")
+    ] = "1.34",
     dock: Annotated[
         list[Path] | None, typer.Option("--dock", metavar="RUN", help="Refine from a run's lights; may be repeated.")
     ] = None,
@@ -61,13 +68,28 @@ def _water(
         return
     if model not in ("plumb_bob", "equidistant"):
         raise InputError(f"--model {model}: wanted plumb_bob or equidistant")
-    from lumidock.setup.water_calibration import calibrate
+    from lumidock.setup.water_calibration import PortGuess, calibrate
 
+    behind = PortGuess(_number("--port", port), _number("--water-index", water_index)) if port is not None else None
     target = _board(board, squares, (square, marker), dictionary)
     sightings, size = _sightings(cast("str", source), target, fps)
-    found = calibrate(target, sightings, size, cast("Literal['plumb_bob', 'equidistant']", model))
+    found = calibrate(target, sightings, size, cast("Literal['plumb_bob', 'equidistant']", model), behind)
     save_camera(found.camera, out)
     print(json.dumps(_as_dict(found), indent=1) if as_json else _told(found, len(sightings), out))
+
+
+def _number(option: str, text: str) -> float | None:
+    """A number of an option, or None for what is to be estimated. Raises: InputError."""
+    if text == "estimate":
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        raise InputError(f"{option} {text}: wanted a number, or estimate") from None
+    low, high = (0.0, 1.0) if option == "--port" else (1.0, 1.5)
+    if not low <= value <= high:
+        raise InputError(f"{option} {text}: wanted {low:g} to {high:g}")
+    return value
 
 
 def _board(kind: str, squares: str, sides_m: tuple[float, float], dictionary: str) -> Board:
@@ -112,6 +134,7 @@ def _as_dict(found: Calibration) -> dict[str, object]:
         "focal_px": found.camera.focal_px.tolist(),
         "center_px": found.camera.center_px.tolist(),
         "sigma": found.sigma.tolist(),
+        "port": asdict(found.camera.port) if found.camera.port else None,
         "calibration_sigma": {"focal": found.sigma_focal, "center_px": found.sigma_center_px},
         "coverage": found.coverage.tolist(),
         "advice": list(found.advice),
@@ -121,11 +144,13 @@ def _as_dict(found: Calibration) -> dict[str, object]:
 def _told(found: Calibration, views: int, out: Path) -> str:
     fx, fy, cx, cy = found.sigma[:4]
     camera = found.camera
+    port = camera.port
     lines = [
         f"views       {views}",
         f"residual    {found.rms_px:.3f} px rms, {found.held_out_px:.3f} px in views that were held out",
         f"focal       {camera.focal_px[0]:.2f} +- {fx:.2f}, {camera.focal_px[1]:.2f} +- {fy:.2f} px",
         f"centre      {camera.center_px[0]:.2f} +- {cx:.2f}, {camera.center_px[1]:.2f} +- {cy:.2f} px",
+        *([f"port        {port.distance_m:.4f} +- {found.sigma[8]:.4f} m, index {port.index:.4f}"] if port else []),
         "coverage    " + "\n            ".join(" ".join(f"{n:5d}" for n in row) for row in found.coverage),
         f"station     calibration_sigma: {{focal: {found.sigma_focal:.5f}, center_px: {found.sigma_center_px:.2f}}}",
         *(f"ADD         {text}" for text in found.advice),
@@ -152,7 +177,7 @@ def _from_dock(runs: list[Path], out: Path, as_json: bool) -> None:
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= 1.0 + focal
     K[:2, 2] += du, dv
-    save_camera(Camera(camera.width, camera.height, K, camera.model, camera.distortion), out)
+    save_camera(replace(camera, K=K), out)
     told = {"focal": float(focal), "center_px": [float(du), float(dv)], "sigma": sigma.tolist()}
     if as_json:
         print(json.dumps(told, indent=1))

@@ -34,7 +34,7 @@ from lumidock.errors import InputError, LumidockError
 from lumidock.evaluation.campaign_table import markdown, row_of
 from lumidock.evaluation.counts import SimulatedRun, Tally, tally_run
 from lumidock.evaluation.cramer_rao import Bound
-from lumidock.methods import Method, implementation, localizer_of
+from lumidock.methods import Aided, Method, implementation, localizer_of
 from lumidock.sim.detections import SimulatedFrame, simulated_frames
 from lumidock.sim.scenario import Scenario, station_of
 from lumidock.station import Station, load_station
@@ -87,6 +87,9 @@ def run_seed(shard: Shard, localizer: Method, seed: int) -> SimulatedRun:
     for frame in frames:
         if frame.step == 0:
             localizer.forget()
+        if isinstance(localizer, Aided):
+            for value in frame.aiding:
+                localizer.aid(value)
         fixes.append(localizer.process_detections(frame.detections))
     eligible = _eligible(shard, frames) if shard.bound else None
     return SimulatedRun(shard.scenario, seed, frames, fixes, shard.station.alert_limits, eligible)

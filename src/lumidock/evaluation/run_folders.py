@@ -52,7 +52,9 @@ def find_runs(folder: Path) -> list[Path]:
         raise InputError(f"{folder}: no such folder")
     runs = sorted(_below(folder, _MOST_DEEP))
     if not runs:
-        raise InputError(f"{folder}: neither a run nor a folder with runs")
+        swapped = (folder / "truth.csv").exists()
+        hint = "; it is a sequence: the run comes first, `lumidock eval RUN SEQUENCE`" if swapped else ""
+        raise InputError(f"{folder}: neither a run nor a folder with runs{hint}")
     return runs
 
 

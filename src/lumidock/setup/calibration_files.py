@@ -188,6 +188,8 @@ def write_calibration(camera: Camera, path: Path, form: str) -> None:
     }
     if form not in writers:
         raise InputError(f"--to {form}: not one of {', '.join(writers)}")
+    if camera.port is not None and form != "ros":
+        raise InputError(f"--to {form}: has no words for the flat port of this camera; --to ros keeps it")
     writers[form](camera, path)
 
 

@@ -13,8 +13,9 @@ from itertools import pairwise
 import numpy as np
 
 from lumidock.camera import Camera
-from lumidock.datatypes import Array, Attitude, Detections, Indices
+from lumidock.datatypes import AidingMeasurement, Array, Attitude, Detections, Indices
 from lumidock.pose import project_lights
+from lumidock.sim.aiding import sensor_values
 from lumidock.sim.course import Course, course_of, mirror_image, project_each, shines
 from lumidock.sim.draws import Draw
 from lumidock.sim.measured import Appearance, DetectionTable, as_measured, detector_errors, with_false
@@ -32,6 +33,7 @@ class SimulatedFrame:
     Pose `T_dock_cam` (4, 4); the index `light` (S,) of the light that made each detection, -1 for a spurious one; the
     pixels `uv` (M, 2) of all lights with their true positions and the true lens; and which lights would be seen if none
     were dark, `in_view` (M,). The frame is number `step` of run number `sequence`; before step 0 there is no history.
+    `aiding`: what the vehicle's own sensors have said since the frame before.
     """
 
     detections: Detections
@@ -41,6 +43,7 @@ class SimulatedFrame:
     in_view: np.ndarray
     sequence: int = 0
     step: int = 0
+    aiding: tuple[AidingMeasurement, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +117,7 @@ def simulated_frames(scenario: Scenario, station: Station, camera: Camera, seed:
             errors, appearance, table, _is_rear(station), scenario.detections.noise_px, detector_rng
         )
     detections = _detections(course, table, appearance, attitudes)
-    bounds = _bounds(course, table)
+    bounds, aiding = _bounds(course, table), sensor_values(scenario, course, seed)
     for number, (frame, (a, b)) in enumerate(zip(detections, pairwise(bounds), strict=True)):
         yield SimulatedFrame(
             frame,
@@ -124,6 +127,7 @@ def simulated_frames(scenario: Scenario, station: Station, camera: Camera, seed:
             visible[number],
             sequence=int(course.run[number]),
             step=int(course.step[number]),
+            aiding=aiding[number],
         )
 
 

@@ -28,5 +28,6 @@ class Draw(IntEnum):
     STRUCTURE_GLINTS = 17
     HOT_PIXELS = 20
     JELLYFISH = 21
-    STATION = 22
-    VEHICLE = 23
+    AIDING = 22
+    STATION = 23
+    VEHICLE = 24

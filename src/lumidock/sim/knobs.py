@@ -266,6 +266,34 @@ class StreamFaults(KnobSection):
     clock_jumps: Probability = 0.0  # probability of a jump
 
 
+class SensorKnobs(KnobSection):
+    """One sensor of the vehicle and its errors, in rad/s (gyro), m/s (DVL), m (depth) or parts of 1 (tilt)."""
+
+    rate_hz: Annotated[float, Field(ge=0.1, le=100.0)]
+    noise: Annotated[float, Field(ge=1e-9, le=1e3)]  # 1 sigma of each number, independent from value to value
+    bias: Annotated[float, Field(ge=0.0, le=1e3)] = 0.0  # 1 sigma of each number, drawn once a run
+    scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0  # 1 sigma of the relative error, drawn once a run
+    mount_deg: Angle = 0.0  # by which it is turned about an axis that is drawn once a run
+    late_s: Annotated[float, Field(ge=-2.0, le=2.0)] = 0.0  # by which its stamps are late
+    wrong_from_s: NonNegativeFloat = 0.0  # time since the start from which it also has ...
+    wrong_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)  # ... this bias ...
+    wrong_scale: float = 0.0  # ... and this relative error
+
+
+def _sensor(**defaults: float) -> Any:  # noqa: ANN401  # what pydantic calls before it reads a section
+    """Fill in what a scenario does not say of a sensor."""
+    return BeforeValidator(lambda given: defaults | given if isinstance(given, dict) else given)
+
+
+class AidingKnobs(KnobSection):
+    """The vehicle's own sensors; none unless given, `{}` for one with the errors that the localizer's settings hold."""
+
+    gyro: Annotated[SensorKnobs | None, _sensor(rate_hz=50.0, noise=0.001, bias=0.0052)] = None  # bias 0.3 degrees/s
+    velocity: Annotated[SensorKnobs | None, _sensor(rate_hz=5.0, noise=0.01, scale=0.03, mount_deg=2.0)] = None
+    depth: Annotated[SensorKnobs | None, _sensor(rate_hz=10.0, noise=0.01, bias=2.0)] = None
+    tilt: Annotated[SensorKnobs | None, _sensor(rate_hz=20.0, noise=0.005, mount_deg=1.0)] = None
+
+
 class DockingKnobs(KnobSection):
     """What a vehicle meets that steers itself into the dock; `path` then gives only the frame rate."""
 

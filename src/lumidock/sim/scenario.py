@@ -14,6 +14,7 @@ from typing_extensions import Self
 from lumidock.datatypes import Array
 from lumidock.errors import InputError
 from lumidock.sim.knobs import (
+    AidingKnobs,
     Angle,
     Angles,
     Counts,
@@ -42,6 +43,9 @@ _DEFAULT_STATION = "cage-2x2x5"
 _BETWEEN_DRAWS_S = 60.0  # more than the time after which every track is dropped
 
 
+_OF_DRAWS = {"count", "hold", "hold_deg_s", "z_m", "turn_deg", "tilt_deg"}  # settings of a path that only draws have
+
+
 class Path3D(KnobSection):
     """The camera's path.
 
@@ -63,6 +67,8 @@ class Path3D(KnobSection):
     near_sway_deg: Angles = (0.35, 0.35, 0.5)
     taper_z_m: tuple[float, float] = (15.0, 2.0)  # z between which the sway shrinks
     sway_period_s: tuple[PositiveFloat, PositiveFloat] = (7.0, 20.0)  # shortest and longest period in the sway
+    rock_deg: Angle = 0.0  # largest pitch and roll of a dock that swings about its origin ...
+    rock_period_s: PositiveFloat = 6.0  # ... with this period
     count: PositiveInt = 1000  # number of draws
     hold: PositiveInt = 1  # consecutive frames of each draw, moving toward the dock at speed_m_s
     hold_deg_s: NonNegativeFloat = 2.0  # largest rate about each axis in these frames
@@ -74,6 +80,9 @@ class Path3D(KnobSection):
     def _path_has_frames(self) -> Self:
         if self.speed_spread_m_s >= self.speed_m_s:
             raise ValueError("speed_spread_m_s: has to be less than speed_m_s")
+        others = _OF_DRAWS & self.model_fields_set
+        if others and self.kind != "draws":
+            raise ValueError(f"{min(others)}: only a path of kind draws has it, and this is of kind {self.kind}")
         if self.kind == "draws":
             if self.count * self.hold > _MAX_FRAMES:
                 raise ValueError(f"count times hold is more than {_MAX_FRAMES} frames")
@@ -147,6 +156,7 @@ class DetectionKnobs(KnobSection):
     calibration: bool = False  # whether the lens has errors of the station's calibration_sigma
     black_outs: BlackOuts = BlackOuts()
     attitude: AttitudeSensor | None = None
+    aiding: AidingKnobs | None = None
 
 
 class Scenario(KnobSection):
@@ -234,12 +244,15 @@ def _apply(content: dict[str, Any], setting: str) -> None:
         raise InputError(f"--set {setting}: the value is not valid YAML") from None
 
 
-def trajectory(scenario: Scenario, rng: np.random.Generator) -> tuple[np.ndarray, Array]:
+def trajectory(
+    scenario: Scenario, rng: np.random.Generator, *, interval_s: float | None = None, rocking: bool = True
+) -> tuple[np.ndarray, Array]:
     """Stamps `t_ns` (N,) and true poses `T_dock_cam` (N, 4, 4) of a scenario that has a path.
 
+    At another interval than that of the frames on demand; without `rocking` the dock is where it is on average.
     Raises: InputError for a path of draws, which has no trajectory.
     """
-    path = scenario.path
+    path = scenario.path if interval_s is None else scenario.path.model_copy(update={"frame_interval_s": interval_s})
     if path.kind == "draws":
         raise InputError(f"{scenario.name}: draws can only be simulated as bare detections (--detections)")
     speed_m_s = path.speed_m_s
@@ -251,7 +264,19 @@ def trajectory(scenario: Scenario, rng: np.random.Generator) -> tuple[np.ndarray
     sway = _wander(t_s, 6, path.sway_period_s, rng)
     shift = sway[:, :3] * (np.array(path.near_sway_m) * (1 - share) + np.array(path.sway_m) * share)
     turn = sway[:, 3:] * np.deg2rad(np.array(path.near_sway_deg) * (1 - share) + np.array(path.sway_deg) * share)
-    return np.round(t_s * 1e9).astype(np.int64), poses(R_DOCK_CAM_HEAD_ON @ rotations(turn), nominal + shift)
+    T_dock_cam = poses(R_DOCK_CAM_HEAD_ON @ rotations(turn), nominal + shift)
+    if path.rock_deg and rocking:
+        T_dock_cam = _rocked(path, t_s, T_dock_cam, rng)
+    return np.round(t_s * 1e9).astype(np.int64), T_dock_cam
+
+
+def _rocked(path: Path3D, t_s: Array, T_mean_cam: Array, rng: np.random.Generator) -> Array:
+    """Poses (N, 4, 4) in a dock that pitches and rolls about its origin, from those in the dock's mean pose."""
+    phase = rng.uniform(0.0, 2 * np.pi, 3)
+    swing = np.sin(2 * np.pi * t_s[:, None] / path.rock_period_s + phase) * np.deg2rad(path.rock_deg) * [1.0, 0.0, 1.0]
+    R_dock_mean = rotations(-swing)
+    R, t = R_dock_mean @ T_mean_cam[:, :3, :3], (R_dock_mean @ T_mean_cam[:, :3, 3:])[:, :, 0]
+    return poses(R, t)
 
 
 def rotations(w: Array) -> Array:

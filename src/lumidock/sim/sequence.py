@@ -22,6 +22,7 @@ from lumidock.camera import Camera, save_camera
 from lumidock.datatypes import Array, Indices
 from lumidock.errors import InputError, LumidockError
 from lumidock.geometry import quat_xyzw_from_rotation
+from lumidock.sim.aiding import measured
 from lumidock.sim.detections import SimulatedFrame, simulated_frames
 from lumidock.sim.draws import Draw
 from lumidock.sim.frames import ExpectedFrame, FrameConditions, FrameRenderer
@@ -274,6 +275,7 @@ def _write_truth(schedule: Schedule, rows: list[Row], written: dict[Row, _Writte
     names = [row.name for row in written]
     poses = schedule.course.T_dock_cam[[row.number for row in written]]
     _write_poses(out, names, [row.t_ns for row in written], poses)
+    _write_aiding(scenario, schedule.seed, out)
     _write_lights_truth(out, names, [truth.lights for truth in written.values()])
     _write_spurious(out, names, [truth.spurious for truth in written.values()])
     if any(row.fault for row in rows):
@@ -313,10 +315,20 @@ def write_detections(scenario: Scenario, station: Station, camera: Camera, seed:
         out / "timestamps.csv", ("frame", "file", "t_ns"), ([name, "", t] for name, t in zip(names, t_ns, strict=True))
     )
     _write_poses(out, names, t_ns, poses)
+    _write_aiding(scenario, seed, out)
     _write_csv(out / "detections.csv", DETECTION_COLUMNS, _detection_rows(frames))
     _write_lights_truth(out, names, [_detection_truth(frame, station) for frame in frames])
     _write_spurious(out, names, [_detection_spurious(frame) for frame in frames])
     return len(frames)
+
+
+def _write_aiding(scenario: Scenario, seed: int, out: Path) -> None:
+    """Write aiding.csv where the scenario has sensors."""
+    knobs = scenario.detections.aiding
+    if knobs is not None and scenario.path.kind != "draws":
+        values = measured(scenario, knobs, seed)
+        lines = ([one.t_ns, one.kind, *one.value, *[""] * (4 - len(one.value)), one.sigma] for one in values)
+        _write_csv(out / "aiding.csv", ("t_ns", "kind", "v0", "v1", "v2", "v3", "sigma"), lines)
 
 
 DETECTION_COLUMNS = ("frame", "u_px", "v_px", "radius_px", "flux", "p_light", "p_rear")

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lumidock.camera import Camera
-from lumidock.datatypes import Frame, Image, Unusable
+from lumidock.datatypes import AidingMeasurement, Frame, Image, Unusable
 from lumidock.errors import FrameError, InputError, extra
 from lumidock.streams import mcapbag, rosbag1, sqlitebag
 from lumidock.streams.bag_info import infos_for
 from lumidock.streams.camera_info import camera_of, difference, is_rectified
 from lumidock.streams.clock import SIM_TIME_BELOW_NS
 from lumidock.streams.ros import PICTURES, Broken, Content, Message, Topic, content_of, info_of, picture_of, size_of
+from lumidock.streams.ros_sensors import SENSORS, values_of
 from lumidock.streams.source import Item, Reading, Size, Source, in_natural_order
 
 _FORMATS = {".mcap": mcapbag, ".db3": sqlitebag, ".bag": rosbag1, ".active": rosbag1}
@@ -102,7 +103,16 @@ def open_bag(path: Path, reading: Reading) -> Source:
         no_calibration=found.problem,
         rectified=found.rectified,
         notes=(*notes, *found.notes),
+        sensors=lambda: _sensor_values(path, topics, clock),
     )
+
+
+def _sensor_values(path: Path, topics: list[Topic], clock: _Clock) -> Iterator[AidingMeasurement]:
+    """Values of the vehicle's sensors, by the clock of the pictures; what is damaged is left out."""
+    names = [topic.name for topic in topics if topic.type in SENSORS]
+    for message in messages_of(path, *names) if names else ():
+        if isinstance(message, Message):
+            yield from values_of(message, by_log=clock == "log")
 
 
 def picture_topics(topics: list[Topic]) -> list[Topic]:

@@ -44,13 +44,14 @@ def check(
 ) -> Verdict:
     """Hold a calibration against what a camera in water should look like; the lens's data make it certain.
 
-    That pictures known to be `rectified` have no distortion needs no comment.
+    That pictures known to be `rectified` have no distortion needs no comment, and behind a stated port the lens is that
+    in air.
     """
     ratio = None
     if lens_mm is not None and pixel_um is not None:
         ratio = float(camera.focal_px.mean()) / (1000.0 * lens_mm / pixel_um)
     bend = curvature(camera)
-    dry = [] if rectified else _dry(bend, ratio, bool(camera.distortion.any()))
+    dry = [] if rectified or camera.port is not None else _dry(bend, ratio, bool(camera.distortion.any()))
     warnings = [*dry, *_odd(camera)]
     return Verdict(_field_of_view(camera), bend, ratio, impossible(camera), tuple(warnings))
 

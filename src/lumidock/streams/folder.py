@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from lumidock.datatypes import ENCODINGS, Array, Attitude, Detections, Frame, Unusable
+from lumidock.datatypes import ENCODINGS, AidingMeasurement, Array, Attitude, Detections, Frame, Unusable
 from lumidock.errors import FrameError, InputError
 from lumidock.geometry import rotation_from_quat_xyzw
 from lumidock.streams.clock import stamp_in_name
 from lumidock.streams.images import SUFFIXES, full_scale, picture_header, read_image
+from lumidock.streams.sensors import AIDING_COLUMNS, aiding_in
 from lumidock.streams.source import Item, Reading, Size, Source, in_natural_order
 
 _INTEGER, _MAX_STAMP = re.compile(r"[+-]?[0-9]{1,19}"), 2**63 - 1
@@ -60,11 +61,18 @@ def _open_sequence(path: Path, reading: Reading) -> Source:
     if not rows:
         raise InputError(f"{stamps}: no frames")
     attitudes = _read_attitudes(attitude) if attitude.exists() else _Attitudes([], np.empty((0, 5)))
-    inputs = (stamps, attitude) if attitude.exists() else (stamps,)
+    inputs = tuple(file for file in (stamps, attitude, path / "aiding.csv") if file.exists())
+    values = _read_aiding(path / "aiding.csv")
     if detections.exists():
         found, inputs = _read_detections(detections), (*inputs, detections)
         return Source(
-            path, "detections", lambda _: _detections(rows, found, attitudes), len(rows), *_beside(path), inputs
+            path,
+            "detections",
+            lambda _: _detections(rows, found, attitudes),
+            len(rows),
+            *_beside(path),
+            inputs,
+            sensors=lambda: values,
         )
     first = path / "frames" / rows[0]["file"]
     return Source(
@@ -75,7 +83,13 @@ def _open_sequence(path: Path, reading: Reading) -> Source:
         *_beside(path),
         inputs,
         notes=_rotation_note(first, reading),
+        sensors=lambda: values,
     )
+
+
+def _read_aiding(path: Path) -> tuple[AidingMeasurement, ...]:
+    """Values of the vehicle's sensors where a sequence has any."""
+    return aiding_in(read_csv(path, AIDING_COLUMNS[:3]), path) if path.exists() else ()
 
 
 def _open_euroc(path: Path, reading: Reading) -> Source:
@@ -118,6 +132,8 @@ def _open_pictures(path: Path, reading: Reading) -> Source:
         sorted((file for file in path.iterdir() if _is_picture(file)), key=in_natural_order)
     )
     if not files:
+        if (path / "truth.csv").exists():
+            raise InputError(f"{path}: a simulation that was interrupted; simulate it anew with `lumidock sim --force`")
         raise InputError(f"{path}: neither timestamps.csv nor any picture ({', '.join(SUFFIXES)}) in it{_hint(path)}")
     notes = list(_rotation_note(files[0], reading))
     if left_out:

@@ -9,7 +9,20 @@ from typing import Any, get_args
 
 import numpy as np
 
-from lumidock.datatypes import Array, Detections, Fix, Guide, Match, Protection, Stage, Status
+from lumidock.datatypes import (
+    Array,
+    Detections,
+    Fix,
+    Guide,
+    Match,
+    Protection,
+    SensorKind,
+    SensorState,
+    SensorUse,
+    Stage,
+    Status,
+    Velocity,
+)
 from lumidock.errors import InputError
 from lumidock.geometry import pose_from_quat
 from lumidock.streams.run_folder import (
@@ -18,9 +31,11 @@ from lumidock.streams.run_folder import (
     GUIDE_COLUMNS,
     LIGHT_COLUMNS,
     PROTECTION_COLUMNS,
+    VELOCITY_COLUMNS,
 )
 
 Row = dict[str, str]
+_LATER_COLUMNS = (*VELOCITY_COLUMNS, "aiding")  # which runs of the first versions do not have
 _POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 
@@ -31,7 +46,8 @@ def read_fixes(folder: Path, light_ids: tuple[str, ...]) -> Iterator[tuple[Fix, 
     """
     path = folder / "fixes.csv"
     lights = _lights(folder / "lights.csv")
-    for number, row in enumerate(_rows(path, FIX_COLUMNS), start=2):
+    needed = tuple(name for name in FIX_COLUMNS if name not in _LATER_COLUMNS)
+    for number, row in enumerate(_rows(path, needed), start=2):
         try:
             yield _fix(row, lights.get(row["frame"], []), light_ids), _integer(row["t_ns"]), _integer(row["latency_us"])
         except (ValueError, KeyError, TypeError) as error:
@@ -84,7 +100,21 @@ def _fix(row: Row, lights: list[Row], light_ids: tuple[str, ...]) -> Fix:
         covariance=None if triangle is None else _symmetric(triangle),
         protection=None if levels is None else Protection(*map(float, levels)),
         guide=Guide(*map(float, guide)) if guide is not None and row["guide"] == "1" else None,
+        velocity=_velocity(row),
+        aiding=tuple(_sensor_use(text) for text in (row.get("aiding") or "").split()),
     )
+
+
+def _velocity(row: Row) -> Velocity | None:
+    """Velocity and rates; of their covariance a run folder holds the diagonal."""
+    numbers = _numbers({name: row.get(name) or "" for name in VELOCITY_COLUMNS}, VELOCITY_COLUMNS)
+    return None if numbers is None else Velocity(numbers[:3], numbers[3:6], np.diag(numbers[6:] ** 2))
+
+
+def _sensor_use(text: str) -> SensorUse:
+    kind, _, said = text.partition("=")
+    state, _, reason = said.partition(":")
+    return SensorUse(_word(kind, SensorKind), _word(state, SensorState), reason)
 
 
 def _word(text: str, kind: Any) -> Any:  # noqa: ANN401  # a Literal of typing

@@ -42,7 +42,30 @@ _DEFINITIONS = {
         "bool is_bigendian\nuint8[] data\n"
     ),
 }
-_UNREADABLE = (SerdeError, ValueError, IndexError, KeyError, TypeError, AssertionError, struct.error, MemoryError)
+# Of DVLs; their drivers also send TwistWithCovarianceStamped.
+DVL, UUV_DVL, COLA_DVL = "marine_acoustic_msgs/msg/Dvl", "uuv_sensor_ros_plugins_msgs/msg/DVL", "cola2_msgs/msg/DVL"
+_DVL_BEAM = (
+    "float64 range\nfloat64 range_covariance\nfloat64 velocity\nfloat64 velocity_covariance\n"
+    "geometry_msgs/PoseStamped pose\n"
+)
+_BEAMED = (
+    "std_msgs/Header header\ngeometry_msgs/Vector3 velocity\nfloat64[9] velocity_covariance\nfloat64 altitude\n"
+    "DVLBeam[] beams\n"
+)
+_DEFINITIONS |= {
+    "uuv_sensor_ros_plugins_msgs/msg/DVLBeam": _DVL_BEAM,
+    UUV_DVL: _BEAMED,
+    "cola2_msgs/msg/DVLBeam": _DVL_BEAM,
+    COLA_DVL: _BEAMED,
+    DVL: (
+        "std_msgs/Header header\nuint8 velocity_mode\nuint8 dvl_type\ngeometry_msgs/Vector3 velocity\n"
+        "float64[9] velocity_covar\nfloat64 altitude\nfloat64 course_gnd\nfloat64 speed_gnd\nuint8 num_good_beams\n"
+        "float32 sound_speed\nbool beam_ranges_valid\nbool beam_velocities_valid\n"
+        "geometry_msgs/Vector3[4] beam_unit_vec\nfloat64[4] range\nfloat32[4] range_covar\nfloat32[4] beam_quality\n"
+        "float32[4] beam_velocity\nfloat32[4] beam_velocity_covar\n"
+    ),
+}
+UNREADABLE = (SerdeError, ValueError, IndexError, KeyError, TypeError, AssertionError, struct.error, MemoryError)
 # by what encoders and formats are called, as PyAV calls the decoder
 _CODECS = {"h264": "h264", "avc": "h264", "h265": "hevc", "hevc": "hevc", "vp9": "vp9", "av1": "av1", "vp8": "vp8"}
 _START = (b"\0\0\0\1", b"\0\0\1")
@@ -119,18 +142,18 @@ def content_of(message: Message) -> Content:
                 f"{message.topic}: messages in an encoding that is not read; read are cdr, ros1 and protobuf",
             )
         return _of_ros(message)
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         why = " ".join(str(error).split()) or type(error).__name__
         raise FrameError("bad_frame", f"{message.topic}: damaged message: {why}") from None
 
 
 def _of_ros(message: Message) -> Content:
-    found = _deserialize(message)
+    found = deserialized(message)
     if message.type == _VIDEO:
         data = np.asarray(found.data, np.uint8)
-        return Content(_stamp_ns(found.timestamp), str(found.frame_id), "video", _codec(str(found.format)), data)
+        return Content(stamp_ns_of(found.timestamp), str(found.frame_id), "video", _codec(str(found.format)), data)
     stamp_ns, frame_id, data = (
-        _stamp_ns(found.header.stamp),
+        stamp_ns_of(found.header.stamp),
         str(found.header.frame_id),
         np.asarray(found.data, np.uint8),
     )
@@ -230,13 +253,13 @@ def info_of(message: Message) -> CameraInfo:
     read: Callable[[Message], CameraInfo] = _info_of_protobuf if message.encoding == "protobuf" else _info_of_ros
     try:
         return read(message)
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         why = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{message.topic}: damaged message: {why}") from None
 
 
 def _info_of_ros(message: Message) -> CameraInfo:
-    info = _deserialize(message)
+    info = deserialized(message)
     d, k, r, p = (
         tuple(float(value) for value in getattr(info, name.upper() if message.encoding == "ros1" else name))
         for name in ("d", "k", "r", "p")
@@ -258,12 +281,14 @@ def _info_of_protobuf(message: Message) -> CameraInfo:
     return CameraInfo(message.topic, frame_id, size, lens, d=d, k=k, r=r, p=p)
 
 
-def _deserialize(message: Message) -> Any:  # noqa: ANN401  # classes made at run time from message definitions
+def deserialized(message: Message) -> Any:  # noqa: ANN401  # classes made at run time from message definitions
+    """The fields of a message of ROS 1 or ROS 2. Raises: one of `UNREADABLE` for one that is damaged."""
     store = typestore(message.encoding)
     if message.encoding == "ros1":
         return store.deserialize_ros1(message.data, message.type)
     return store.deserialize_cdr(message.data, message.type)
 
 
-def _stamp_ns(stamp: Any) -> int:  # noqa: ANN401
+def stamp_ns_of(stamp: Any) -> int:  # noqa: ANN401
+    """A stamp of ROS in ns."""
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)

@@ -128,7 +128,8 @@ def messages(
         transform = _transform(frames.dock, frames.camera, t_ns, fix.T_dock_cam)
         yield _serialized("/tf", t_ns, _make("tf2_msgs/msg/TFMessage", [transform]))
     if picture and isinstance(item, Frame):
-        yield _serialized(f"{PREFIX}/camera_info", t_ns, _camera_info(camera, t_ns, frames))
+        if camera.port is None:  # CameraInfo has no words for a port
+            yield _serialized(f"{PREFIX}/camera_info", t_ns, _camera_info(camera, t_ns, frames))
         yield _serialized(f"{PREFIX}/image/compressed", t_ns, _compressed(item, t_ns, frames))
         yield _serialized(f"{PREFIX}/annotations", t_ns, _annotations(fix, t_ns, light_ids))
 

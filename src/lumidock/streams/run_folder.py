@@ -16,13 +16,17 @@ from typing import Any
 import numpy as np
 from typing_extensions import Self
 
-from lumidock.datatypes import Array, Fix, Protection
+from lumidock.datatypes import Array, Fix, Protection, Velocity
 from lumidock.errors import InputError
 from lumidock.geometry import bearing_and_range, quat_xyzw_from_rotation
 
 COVARIANCE_COLUMNS = tuple(f"c{i}{j}" for i in range(6) for j in range(i, 6))
 PROTECTION_COLUMNS = ("pl_lateral_m", "pl_axial_m", "pl_angle_rad")
 GUIDE_COLUMNS = ("bearing_x_rad", "bearing_y_rad", "range_m", "pl_bearing_rad", "pl_range_m")
+VELOCITY_COLUMNS = (
+    *("vx_m_s", "vy_m_s", "vz_m_s", "wx_rad_s", "wy_rad_s", "wz_rad_s"),
+    *("sigma_vx_m_s", "sigma_vy_m_s", "sigma_vz_m_s", "sigma_wx_rad_s", "sigma_wy_rad_s", "sigma_wz_rad_s"),
+)
 FIX_COLUMNS = (
     *("frame", "t_ns", "valid", "guide", "status", "stage", "n_seen", "n_used"),
     *("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
@@ -30,6 +34,8 @@ FIX_COLUMNS = (
     *PROTECTION_COLUMNS,
     *GUIDE_COLUMNS,
     *("reason", "latency_us"),
+    *VELOCITY_COLUMNS,
+    "aiding",
 )
 LIGHT_COLUMNS = ("frame", "u_px", "v_px", "radius_px", "flux", "p_light", "p_rear", "light")
 LAYER_COLUMNS = ("frame", "layer", "n_used", "matched_by", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -155,7 +161,15 @@ def _fix_row(fix: Fix, latency_us: int | None, t_ns: int | None) -> list[object]
         *_guide_fields(fix),
         fix.reason,
         "" if latency_us is None else latency_us,
+        *_velocity_fields(fix.velocity),
+        " ".join(map(str, fix.aiding)),
     ]
+
+
+def _velocity_fields(velocity: Velocity | None) -> list[str]:
+    if velocity is None:
+        return [""] * len(VELOCITY_COLUMNS)
+    return [_short(value, 6) for value in (*velocity.linear_m_s, *velocity.angular_rad_s, *velocity.sigma)]
 
 
 def _covariance_fields(covariance: Array | None) -> list[str]:

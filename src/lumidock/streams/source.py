@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from lumidock.camera import Camera
-from lumidock.datatypes import Detections, Frame, Unusable
+from lumidock.datatypes import AidingMeasurement, Detections, Frame, Unusable
 
 Item = Frame | Detections | Unusable
 Size = tuple[int, int]
@@ -41,7 +41,7 @@ class Source:
     `camera` and `station` are files found beside the frames, `calibration` the camera that a recording describes (of
     `rectified` pictures, perhaps) and `no_calibration` why it has none to offer; `inputs` are the files whose hashes
     identify the source, `notes` what a person should know of how it is read, a line each. A `live` one has no end, and
-    is opened again when it is lost.
+    is opened again when it is lost. `sensors` gives the values of the vehicle's own sensors as they come.
     `read` is given the size (width, height) that pictures must have, or None, and reads none that has another.
     """
 
@@ -57,6 +57,7 @@ class Source:
     rectified: bool = False
     live: bool = False
     notes: tuple[str, ...] = field(default=())
+    sensors: Callable[[], Iterable[AidingMeasurement]] = tuple
 
     def items(self, size: Size | None = None) -> Iterator[Item]:
         """All frames from the first; one that is not of `size` (width, height) is a bad frame, its pixels unread."""

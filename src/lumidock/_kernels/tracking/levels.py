@@ -19,12 +19,14 @@ _TILT_SHARE = 0.51  # of the factor on sigma, for what the square of a plane's t
 class SigmaFactors(NamedTuple):
     """Factors (3,) on sigma, in one, two and three dimensions.
 
-    Without a fault; with one light at fault that geometry has not proven; and with one that it has.
+    Without a fault; with one light at fault that geometry has not proven; with one that it has; and with a sensor of
+    the vehicle at fault that the lights have not proven.
     """
 
     fault_free: Array
     unproven: Array
     proven: Array
+    sensor: Array
 
 
 class Groups(NamedTuple):
@@ -84,11 +86,11 @@ def protection_levels(
     """Protection levels: lateral m, axial m, angle rad, bearing rad, range m; `cov` (9, 9) of `outputs` is filled.
 
     The filter's own, on the `plane` (6,) of its last lights, and that of every state of the `bank` that is blind to a
-    light: how far it is off the filter and what it may be off itself.
+    light or, after those, to a sensor: how far it is off the filter and what it may be off itself.
     """
     C = outputs(state.R, state.t)
     level, other, apart, theirs = np.zeros(5), np.empty(5), np.zeros(9), np.empty((9, 9))
-    nowhere = np.full(6, np.nan)
+    nowhere, sensors = np.full(6, np.nan), groups.group.max() + 1
     _levels(state, C, state.P, plane, apart, factors.fault_free, cov, level)
     for s in range(len(bank.begun)):
         if bank.begun[s] == 0:
@@ -99,6 +101,7 @@ def protection_levels(
                 apart[i] += C[i, k] * bank.offset[s, k]
         flat = groups.planes[bank.plane[s]] if bank.plane[s] >= 0 else nowhere
         k_fault = factors.proven if all_proven(bank, groups.group, s) else factors.unproven
+        k_fault = factors.sensor if s >= sensors else k_fault
         _levels(state, C, bank.P[s], flat, apart, k_fault, theirs, other)
         for i in range(5):
             level[i] = max(level[i], other[i])
