@@ -16,17 +16,19 @@ from lumidock.docking.vehicle import VEHICLES
 from lumidock.sim.scenario import load_scenario
 
 SEED = 40_000
-DOCKINGS = int(os.environ.get("BENCH_DOCKINGS", "100"))
+DOCKINGS = int(os.environ.get("BENCH_DOCKINGS", "40"))
 ROWS = (
     ("docking", "rov", "lumidock", DOCKINGS),
     ("docking", "auv", "lumidock", DOCKINGS),
+    ("docking", "rov", "aided", DOCKINGS // 2),
     ("docking-hard", "rov", "lumidock", DOCKINGS // 2),
     ("docking-hard", "auv", "lumidock", DOCKINGS // 2),
+    ("docking-hard", "rov", "aided", DOCKINGS // 2),
     ("docking-moved", "rov", "lumidock", DOCKINGS // 4),
-    ("docking", "rov", "raw", DOCKINGS // 5),
-    ("docking-hard", "rov", "raw", DOCKINGS // 5),
-    ("docking", "rov", "paper", DOCKINGS // 10),
-    ("docking-hard", "rov", "paper", DOCKINGS // 10),
+    ("docking", "rov", "raw", DOCKINGS // 4),
+    ("docking-hard", "rov", "raw", DOCKINGS // 4),
+    ("docking", "rov", "paper", DOCKINGS // 8),
+    ("docking-hard", "rov", "paper", DOCKINGS // 8),
 )
 
 

@@ -1,6 +1,7 @@
 """The go / no-go: what it must never allow, whatever the numbers, and what it says of plain cases."""
 
 import math
+import socket
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +9,11 @@ import pytest
 from bench.shipped import shipped_station
 from hypothesis import given
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common
 
-from lumidock.datatypes import Fix, Guide, Protection
+from lumidock.datatypes import Fix, Guide, Protection, Unusable
 from lumidock.go_no_go import WORDS, Passage, Situation, Watch, advise
+from lumidock.streams.go_no_go_link import VALUES, GoNoGoLink
 
 PASSAGE = Passage(opening_m=0.94, vehicle_m=0.35)
 NUMBERS = st.floats(0.0, 40.0)
@@ -103,3 +106,31 @@ def test_a_guide_alone_brings_the_vehicle_to_the_gate_and_no_further():
 
     assert (guided(12.0).verdict, guided(12.0).word) == ("go", "approach")
     assert guided(2.0).verdict == "hold"
+
+
+def received(receiver):
+    """All messages that wait on a socket."""
+    parser, found = common.MAVLink(None), []
+    while True:
+        try:
+            found += parser.parse_buffer(receiver.recv(2048)) or []
+        except BlockingIOError:
+            return found
+
+
+def test_mavlink_carries_the_value_with_every_fix_and_the_word_when_it_changes():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.setblocking(False)
+        link = GoNoGoLink("127.0.0.1", receiver.getsockname()[1], Watch(PASSAGE))
+        link.tick()
+        for k in range(3):
+            fix = pose_fix(0.1 * k, 2.0 - 0.03 * k)
+            link.add(Unusable(fix.frame, fix.t_ns, "", ""), fix, 100)
+        messages = received(receiver)
+        link.close()
+    values = [m.value for m in messages if m.get_type() == "NAMED_VALUE_INT"]
+    assert values == [VALUES["hold"], *[VALUES["go"]] * 3]
+    assert {m.name for m in messages if m.get_type() == "NAMED_VALUE_INT"} == {"go_no_go"}
+    texts = [m.text for m in messages if m.get_type() == "STATUSTEXT"]
+    assert texts == ["dock: hold (no_fix)", "dock: go (clear)"]

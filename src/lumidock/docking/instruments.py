@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lumidock.docking.vehicle import Motion, Three, VehicleModel
+from lumidock.datatypes import AidingMeasurement, Array
+from lumidock.docking.vehicle import R_BODY_CAM_AHEAD, Motion, Three, VehicleModel
+from lumidock.geometry import so3_log
 
 DVL_SCALE, DVL_BIAS_M_S, _DVL_NOISE_M_S = 0.01, 0.003, 0.01  # 1 sigma. Source: Water Linked A50, data sheet
 _GYRO_BIAS_RAD_S, _GYRO_NOISE_RAD_S = math.radians(0.05), math.radians(0.1)  # industrial MEMS, bias in run
@@ -65,6 +67,23 @@ class Instruments:
             heading_rad=motion.heading_rad + self.heading_bias,
             pitch_rad=pitch_roll[0] + self.tilt_bias[0],
             roll_rad=pitch_roll[1] + self.tilt_bias[1],
+        )
+
+    def aiding(self, T_dock_cam: Array, T_dock_later: Array, t_ns: int, dt_s: float) -> tuple[AidingMeasurement, ...]:
+        """Rotation rate and velocity in cam axes over the `dt_s` that end at `t_ns`, as the method takes them.
+
+        The poses are those of cam at its begin and at its end; biases and scale are those of `read`.
+        """
+        noise = self.rng.normal(size=(2, 3))
+        R_cam_body, R_dock_cam = R_BODY_CAM_AHEAD.T, T_dock_cam[:3, :3]
+        rate = so3_log(R_dock_cam.T @ T_dock_later[:3, :3]) / dt_s
+        rate += R_cam_body @ np.array([0.0, 0.0, self.gyro_bias]) + _GYRO_NOISE_RAD_S * noise[0]
+        velocity = R_dock_cam.T @ (T_dock_later[:3, 3] - T_dock_cam[:3, 3]) / dt_s
+        velocity = self.scale * velocity + R_cam_body @ np.array(self.bias) + _DVL_NOISE_M_S * noise[1]
+        middle_ns = t_ns - round(0.5e9 * dt_s)
+        return (
+            AidingMeasurement("gyro", middle_ns, tuple(rate.tolist()), _GYRO_NOISE_RAD_S),
+            AidingMeasurement("velocity", middle_ns, tuple(velocity.tolist()), _DVL_NOISE_M_S),
         )
 
     def homed(self, model: VehicleModel, motion: Motion) -> Three:

@@ -16,11 +16,12 @@ from lumidock.docking.cage import Frame
 from lumidock.docking.control import Controller
 from lumidock.docking.guidance import steer, sweep
 from lumidock.docking.instruments import Instruments
-from lumidock.docking.methods import docking_method
+from lumidock.docking.methods import AIDED, docking_method
 from lumidock.docking.navigation import Navigator
 from lumidock.docking.states import DOCKED_M, Machine, Step, Transition
 from lumidock.docking.vehicle import R_DOCK_APPROACH, Current, Motion, Rocking, T_dock_cam_of, Three, VehicleModel
 from lumidock.go_no_go import Advice, Passage
+from lumidock.localizer import Localizer
 from lumidock.methods import Method
 from lumidock.sim.draws import Draw
 from lumidock.sim.point_camera import PointCamera, point_camera
@@ -153,12 +154,13 @@ def start(docking: Docking) -> World:
 
 @dataclass(slots=True)
 class Pilot:
-    """All that is aboard: navigation, state machine, control and the method."""
+    """All that is aboard: navigation, state machine, control and the method; `aided` is it, where it takes aiding."""
 
     navigator: Navigator
     machine: Machine
     controller: Controller
     method: Method
+    aided: Localizer | None = None
     wanted_step: Step | None = None
     moments: list[Moment] = field(default_factory=list)
 
@@ -171,7 +173,9 @@ def aboard(docking: Docking, world: World) -> Pilot:
     passage = replace(Passage.of(station, model.radius_m), entry_m_s=2.0 * model.entry_m_s)
     machine = Machine(passage, model, -float(station.docking_point[2]))
     config = validate(Config, docking.scenario.config, f"{docking.scenario.name}: config")
-    return Pilot(navigator, machine, Controller(model), docking_method(docking.method, station, docking.camera, config))
+    method = docking_method(docking.method, station, docking.camera, config)
+    aided = method if docking.method == AIDED and isinstance(method, Localizer) else None
+    return Pilot(navigator, machine, Controller(model), method, aided)
 
 
 def run(docking: Docking) -> tuple[Verdict, list[Moment]]:
@@ -253,7 +257,12 @@ def _sail(world: World, pilot: Pilot, t_s: float, interval_s: float) -> None:
         if step.state == "search" and t_s - pilot.machine.since_s > 10.0:
             wanted = replace(wanted, heading_rad=wanted.heading_rad + sweep(t_s))
         thrust = pilot.controller.step(wanted, reading, navigator.heading_rad, dt_s)
+        before_s, after_s = t_s + k * dt_s, t_s + (k + 1) * dt_s
+        T_dock_cam = world.pose(before_s) if pilot.aided is not None else None
         world.motion.step(thrust, world.water.step(dt_s), dt_s)
+        if pilot.aided is not None and T_dock_cam is not None:
+            for value in world.instruments.aiding(T_dock_cam, world.pose(after_s), round(after_s * 1e9), dt_s):
+                pilot.aided.aid(value)
         navigator.reckon(reading, dt_s)
 
 

@@ -1,4 +1,7 @@
-"""The methods that can guide a docking: all that there are by name, and `raw`, the default method's poses unproven."""
+"""The methods that can guide a docking: all that there are by name, and two variants of the default one.
+
+`aided` is given the vehicle's gyro and DVL; `raw` follows the poses whether or not they are proven.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +17,20 @@ from lumidock.localizer import Localizer
 from lumidock.methods import Method, localizer_of, require_method
 from lumidock.station import Station
 
-RAW = "raw"
+RAW, AIDED = "raw", "aided"
 
 
 def require_docking_method(name: str) -> None:
     """Raises: InputError for a method that there is not."""
-    if name != RAW:
+    if name not in (RAW, AIDED):
         require_method(name)
 
 
 def docking_method(name: str, station: Station, camera: Camera, config: Config) -> Method:
     """A method by its name. Raises: InputError for one that there is not."""
-    return RawPoses(station, camera, config) if name == RAW else localizer_of(name, station, camera, config)
+    if name == RAW:
+        return RawPoses(station, camera, config)
+    return localizer_of("lumidock" if name == AIDED else name, station, camera, config)
 
 
 class RawPoses:

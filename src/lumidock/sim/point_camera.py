@@ -92,11 +92,11 @@ class PointCamera:
         if any(first <= t_s <= last for first, last in knobs.front_off_s):
             dark |= self.front
         if self.scenario.faults.missing[1] == 0:
-            return dark
+            return np.asarray(dark)
         among = np.flatnonzero(visible & self.front)
         count = min(int(self.rng.integers(*self.scenario.faults.missing, endpoint=True)), len(among))
         dark[self.rng.choice(among, count, replace=False)] = True
-        return dark
+        return np.asarray(dark)
 
     def spurious(self, number: int, one: Course, lights_uv: Array) -> Array:
         """Pixels (S, 2) of spurious detections: those that wander, those of this frame alone, and glints."""
