@@ -34,7 +34,7 @@ from lumidock.station import load_station
 
 if TYPE_CHECKING:
     from lumidock.docking.campaign import InFull
-    from lumidock.docking.loop import Docking, Verdict
+    from lumidock.docking.loop import Docking, DockingResult
     from lumidock.report.docking_page import DockingView
     from lumidock.report.page import Tile
 
@@ -92,9 +92,9 @@ def _dock(
         others = run_campaign(replace(docking, seed=first + 1), names, stop - first - 1, workers or 1, progress)
     blocks = {one.block.method: [one.block, *others[one.block.method]] for one in shown}
     content = {name: counted(found) for name, found in blocks.items()}
-    verdicts = {name: [v.as_dict() for block in found for v in block.verdicts] for name, found in blocks.items()}
+    results = {name: [v.as_dict() for block in found for v in block.results] for name, found in blocks.items()}
     described = {"scenario": loaded.model_dump(mode="json"), "vehicle": vehicle, "seeds": [first, stop]}
-    (out / "docking.json").write_text(json.dumps(described | {"methods": content, "dockings": verdicts}, indent=1))
+    (out / "docking.json").write_text(json.dumps(described | {"methods": content, "dockings": results}, indent=1))
     if find_spec("matplotlib") and find_spec("jinja2"):
         _write_page(docking, shown[:_MOST_IN_FULL], content, out / "docking.html")
     if video and stop - first == 1 and find_spec("av"):
@@ -105,7 +105,7 @@ def _dock(
     for name, counts in content.items():
         print(" | ".join(f"{head} {cell}" for head, cell in zip(HEAD, row(name, counts), strict=True)))
     if stop - first == 1:
-        for change in shown[0].verdict.log:
+        for change in shown[0].result.log:
             print(f"{change.t_s:7.1f} s  {change.state:9} {change.why}")
     print(f"written to {out}")
 
@@ -138,10 +138,10 @@ def _view(docking: Docking, one: InFull) -> DockingView:
     from lumidock.go_no_go import Passage
     from lumidock.report.docking_page import DockingView
 
-    moments, verdict = one.moments, one.verdict
+    moments, result = one.moments, one.result
     passage = Passage.of(docking.station, docking.vehicle.radius_m)
     return DockingView(
-        title=f"{one.block.method}, seed {verdict.seed}",
+        title=f"{one.block.method}, seed {result.seed}",
         station=docking.station,
         t_s=np.array([m.t_s for m in moments]),
         true_dock=np.array([m.T_dock_cam[:3, 3] for m in moments]),
@@ -152,22 +152,22 @@ def _view(docking: Docking, one: InFull) -> DockingView:
         word=[m.step.advice.word for m in moments],
         valid=np.array([m.fix is not None and m.fix.valid for m in moments]),
         guided=np.array([m.fix is not None and m.fix.guide is not None for m in moments]),
-        changes=[[f"{c.t_s:.1f}", c.state, c.why] for c in verdict.log],
-        tiles=_tiles(verdict),
+        changes=[[f"{c.t_s:.1f}", c.state, c.why] for c in result.log],
+        tiles=_tiles(result),
         opening_m=passage.opening_m,
         vehicle_m=passage.vehicle_m,
     )
 
 
-def _tiles(verdict: Verdict) -> list[Tile]:
+def _tiles(result: DockingResult) -> list[Tile]:
     from lumidock.report.page import Tile
 
     return [
-        Tile(verdict.outcome, verdict.word, "good" if verdict.docked else "bad"),
-        Tile(f"{verdict.time_s:.0f} s", "from the start"),
-        Tile(f"{100.0 * verdict.miss_m:.0f} cm", "camera from the docking point at the end"),
-        Tile(f"{verdict.room_m:.2f} m", "least room between hull and frame", "bad" if verdict.contact else "good"),
-        Tile(f"{verdict.worst_fix_m:.2f} m", "largest error of a pose that was followed"),
-        Tile(f"{verdict.current_m_s:.2f} m/s", "current"),
-        Tile(str(verdict.tries), "times backed out"),
+        Tile(result.outcome, result.word, "good" if result.docked else "bad"),
+        Tile(f"{result.time_s:.0f} s", "from the start"),
+        Tile(f"{100.0 * result.miss_m:.0f} cm", "camera from the docking point at the end"),
+        Tile(f"{result.room_m:.2f} m", "least room between hull and frame", "bad" if result.contact else "good"),
+        Tile(f"{result.worst_fix_m:.2f} m", "largest error of a pose that was followed"),
+        Tile(f"{result.current_m_s:.2f} m/s", "current"),
+        Tile(str(result.tries), "times backed out"),
     ]

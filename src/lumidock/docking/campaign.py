@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from lumidock.docking.loop import Docking, Moment, Verdict, run
+from lumidock.docking.loop import Docking, DockingResult, Moment, run
 from lumidock.evaluation.campaign import worker_pool
 
 _BLOCK = 5  # dockings of one method in one job
@@ -21,10 +21,10 @@ Progress = Callable[[int, int | None], None]
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """The verdicts of successive seeds by one method, and the processor seconds that they took."""
+    """What came of successive seeds by one method, and the processor seconds that they took."""
 
     method: str
-    verdicts: tuple[Verdict, ...]
+    results: tuple[DockingResult, ...]
     seconds: float
 
 
@@ -36,24 +36,24 @@ class InFull:
     moments: tuple[Moment, ...]
 
     @property
-    def verdict(self) -> Verdict:
+    def result(self) -> DockingResult:
         """What came of it."""
-        return self.block.verdicts[0]
+        return self.block.results[0]
 
 
 def in_full(docking: Docking) -> InFull:
     """One docking, of which everything is kept."""
     start = time.process_time()
-    verdict, moments = run(docking)
-    return InFull(Block(docking.method, (verdict,), time.process_time() - start), tuple(moments))
+    result, moments = run(docking)
+    return InFull(Block(docking.method, (result,), time.process_time() - start), tuple(moments))
 
 
 def run_block(first: Docking, count: int) -> Block:
     """So many dockings from the seed of the `first` on; runs in a worker process."""
     cv2.setNumThreads(1)
     start = time.process_time()
-    verdicts = tuple(run(replace(first, seed=first.seed + k))[0] for k in range(count))
-    return Block(first.method, verdicts, time.process_time() - start)
+    results = tuple(run(replace(first, seed=first.seed + k))[0] for k in range(count))
+    return Block(first.method, results, time.process_time() - start)
 
 
 def run_campaign(
@@ -82,37 +82,37 @@ def _blocks(jobs: list[tuple[Docking, int]], workers: int) -> Iterator[Block]:
 
 def counted(blocks: Sequence[Block]) -> dict[str, Any]:
     """What came of the dockings of one method, as numbers for JSON and tables."""
-    verdicts = [verdict for block in blocks for verdict in block.verdicts]
-    docked = [verdict for verdict in verdicts if verdict.docked]
-    aborted = [verdict for verdict in verdicts if verdict.outcome == "aborted"]
-    worst = [verdict.worst_fix_m for verdict in verdicts if math.isfinite(verdict.worst_fix_m)]
+    results = [result for block in blocks for result in block.results]
+    docked = [result for result in results if result.docked]
+    aborted = [result for result in results if result.outcome == "aborted"]
+    worst = [result.worst_fix_m for result in results if math.isfinite(result.worst_fix_m)]
     seconds = sum(block.seconds for block in blocks)
     return {
-        "runs": len(verdicts),
+        "runs": len(results),
         "docked": len(docked),
-        "not_at_the_point": sum(v.outcome == "docked" and not v.docked for v in verdicts),
-        "contacts": sum(v.contact for v in verdicts),
+        "not_at_the_point": sum(v.outcome == "docked" and not v.docked for v in results),
+        "contacts": sum(v.contact for v in results),
         "aborts_right": sum(v.right for v in aborted),
         "aborts_wrong": sum(not v.right for v in aborted),
-        "out_of_time": sum(v.outcome == "out_of_time" for v in verdicts),
-        "why": dict(Counter(v.word for v in verdicts if not v.docked)),
+        "out_of_time": sum(v.outcome == "out_of_time" for v in results),
+        "why": dict(Counter(v.word for v in results if not v.docked)),
         "median_s": float(np.median([v.time_s for v in docked])) if docked else None,
-        "retries": sum(v.tries for v in verdicts),
+        "retries": sum(v.tries for v in results),
         "worst_fix_m": max(worst, default=None),
-        "misleading": sum(v.misleading for v in verdicts),
-        "valid_share": sum(v.valid for v in verdicts) / max(sum(v.frames for v in verdicts), 1),
-        "least_room_m": min((v.room_m for v in verdicts if math.isfinite(v.room_m)), default=None),
-        "dockings_per_s": len(verdicts) / seconds if seconds else None,
-        "by_current": by_current(verdicts),
+        "misleading": sum(v.misleading for v in results),
+        "valid_share": sum(v.valid for v in results) / max(sum(v.frames for v in results), 1),
+        "least_room_m": min((v.room_m for v in results if math.isfinite(v.room_m)), default=None),
+        "dockings_per_s": len(results) / seconds if seconds else None,
+        "by_current": by_current(results),
     }
 
 
-def by_current(verdicts: Sequence[Verdict]) -> dict[str, list[int]]:
+def by_current(results: Sequence[DockingResult]) -> dict[str, list[int]]:
     """Docked and all dockings in currents under 0.17, under 0.34, and faster, m/s."""
     bins: dict[str, list[int]] = {"<0.17": [0, 0], "<0.34": [0, 0], ">0.34": [0, 0]}
-    for verdict in verdicts:
-        name = "<0.17" if verdict.current_m_s < 0.17 else "<0.34" if verdict.current_m_s < 0.34 else ">0.34"
-        bins[name][0] += verdict.docked
+    for result in results:
+        name = "<0.17" if result.current_m_s < 0.17 else "<0.34" if result.current_m_s < 0.34 else ">0.34"
+        bins[name][0] += result.docked
         bins[name][1] += 1
     return bins
 

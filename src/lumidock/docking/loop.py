@@ -20,7 +20,7 @@ from lumidock.docking.methods import AIDED, docking_method
 from lumidock.docking.navigation import Navigator
 from lumidock.docking.states import DOCKED_M, Machine, Step, Transition
 from lumidock.docking.vehicle import R_DOCK_APPROACH, Current, Motion, Rocking, T_dock_cam_of, Three, VehicleModel
-from lumidock.go_no_go import Advice, Passage
+from lumidock.go_no_go import Passage
 from lumidock.localizer import Localizer
 from lumidock.methods import Method
 from lumidock.sim.draws import Draw
@@ -68,7 +68,7 @@ class Moment:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class DockingResult:
     """What came of a docking.
 
     `miss_m`: true distance of the camera from the docking point at the end; `room_m`: least distance between hull and
@@ -178,7 +178,7 @@ def aboard(docking: Docking, world: World) -> Pilot:
     return Pilot(navigator, machine, Controller(model), method, aided)
 
 
-def run(docking: Docking) -> tuple[Verdict, list[Moment]]:
+def run(docking: Docking) -> tuple[DockingResult, list[Moment]]:
     """One docking from the start to its end. Raises: InputError for a scenario that cannot be a closed loop."""
     interval_s = docking.scenario.path.frame_interval_s
     frames = int(docking.scenario.docking.time_limit_s / interval_s)
@@ -190,7 +190,7 @@ def run(docking: Docking) -> tuple[Verdict, list[Moment]]:
         if _frame(number, docking, world, pilot, look if number in eye.rows else None):
             break
         _sail(world, pilot, number * interval_s, interval_s)
-    return _verdict(docking, world, pilot), pilot.moments
+    return _result(docking, world, pilot), pilot.moments
 
 
 def camera_of(docking: Docking, camera: Camera, frames: int) -> PointCamera:
@@ -266,12 +266,12 @@ def _sail(world: World, pilot: Pilot, t_s: float, interval_s: float) -> None:
         navigator.reckon(reading, dt_s)
 
 
-def _verdict(docking: Docking, world: World, pilot: Pilot) -> Verdict:
+def _result(docking: Docking, world: World, pilot: Pilot) -> DockingResult:
     moments, log = pilot.moments, pilot.machine.log
     last, state = moments[-1], pilot.machine.state
     outcome: Outcome = "docked" if state == "docked" else "aborted" if state == "abort" else "out_of_time"
     fixes = [moment for moment in moments if math.isfinite(moment.error_m)]
-    return Verdict(
+    return DockingResult(
         seed=docking.seed,
         outcome=outcome,
         word=log[-1].why if outcome != "out_of_time" else state,
@@ -301,16 +301,11 @@ def is_misleading(moment: Moment, station: Station) -> bool:
 
 def had_a_cause(docking: Docking, pilot: Pilot) -> bool:
     """Whether an abort was right: the station is not as surveyed, too few lights were seen, or the way was missed."""
-    knobs = docking.scenario
-    if knobs.docking.station_off_m > 0.0 or knobs.detections.bent_m > 0.0 or knobs.lens.focal_error != 0.0:
+    scenario = docking.scenario
+    if scenario.docking.station_off_m > 0.0 or scenario.detections.bent_m > 0.0 or scenario.lens.focal_error != 0.0:
         return True
     leaving = next(one.t_s for one in reversed(pilot.machine.log) if one.state in ("back_out", "abort"))
     before = [one for one in pilot.moments if leaving - pilot.machine.passage.blind_s <= one.t_s <= leaving]
     dark = sum(one.lights_seen < _POSE_LIGHTS for one in before) > 0.5 * len(before)
     x, y, z = before[-1].T_dock_cam[:3, 3]
     return bool(dark or (z < pilot.machine.passage.gate_m and math.hypot(x, y) > pilot.machine.passage.clearance_m))
-
-
-def advice_of(moment: Moment) -> Advice:
-    """The go / no-go of a moment."""
-    return moment.step.advice
