@@ -48,7 +48,7 @@ def limited(value: float, most: float) -> float:
 link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{MAVLINK}")
 command = [sys.executable, "-m", "lumidock", "serve", f"rtp://127.0.0.1:{VIDEO}", "--mavlink", f"127.0.0.1:{MAVLINK}"]
 command += ["--station", sys.argv[1], "--camera", sys.argv[2], "--vehicle", sys.argv[3]]
-server = subprocess.Popen([*command, "--hull-radius", str(ROV.radius_m), "--drift", "0.05", "--health-port", "0"])
+server = subprocess.Popen([*command, "--go-no-go", f"{ROV.radius_m}:0.05", "--health-port", "0"])
 video = av.open(f"rtp://127.0.0.1:{VIDEO}", "w", format="rtp")
 coding = {"tune": "zerolatency", "preset": "ultrafast", "g": "8", "crf": "16"}
 stream = video.add_stream("libx264", rate=FPS, options=coding)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import signal
 import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -77,18 +78,14 @@ MavlinkOption = Annotated[
     str | None,
     typer.Option("--mavlink", metavar="HOST:PORT", help="Send VISION_POSITION_ESTIMATE by UDP; needs --vehicle."),
 ]
-HullRadius = Annotated[
-    float | None,
+GoNoGoOption = Annotated[
+    str | None,
     typer.Option(
-        "--hull-radius",
-        metavar="M",
-        min=0.01,
-        help="Of a circle that holds the vehicle's cross-section: gives the go / no-go, in health and by MAVLink.",
+        "--go-no-go",
+        metavar="M[:M/S]",
+        help="Say go, hold or abort, in health and by MAVLink, to a vehicle of this cross-section radius that "
+        f"may move so fast unnoticed; {DRIFT_M_S:g} m/s unless given.",
     ),
-]
-Drift = Annotated[
-    float,
-    typer.Option("--drift", metavar="M/S", min=0.0, help="How fast the vehicle may move unnoticed, as in a current."),
 ]
 ZenohOption = Annotated[
     str | None,
@@ -134,8 +131,7 @@ def _serve(
     config: ConfigOption = None,
     loop: Annotated[bool, typer.Option("--loop", help="Show a recording again and again.")] = False,
     mavlink: MavlinkOption = None,
-    hull_radius: HullRadius = None,
-    drift: Drift = DRIFT_M_S,
+    go_no_go: GoNoGoOption = None,
     zenoh: ZenohOption = None,
     dds: Annotated[bool, typer.Option("--dds", help="Publish to ROS 2 by DDS.")] = False,
     domain: Annotated[int, typer.Option(metavar="N", min=0, max=232, help="ROS_DOMAIN_ID.")] = 0,
@@ -152,7 +148,6 @@ def _serve(
     """Localize live and send every fix to the vehicle, until stopped."""
     require_method(method)
     settings = load_config(config) if config else Config()
-    mounting = load_vehicle(vehicle) if vehicle else None
     with ExitStack() as stack:
         if source.startswith(SIM):
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -163,17 +158,14 @@ def _serve(
         station_file = file_of("station", station, opened.station, opened)
         calibration = calibration_of(camera, opened, name=camera_name, trusted=trust_calibration)
         tell((*opened.notes, *calibration.warnings))
-        setting = Setting(load_station(station_file), calibration.camera, mounting)
+        setting = Setting(load_station(station_file), calibration.camera, load_vehicle(vehicle) if vehicle else None)
         sinks = [
             *_vehicle_sinks(setting, mavlink, zenoh, domain if dds else None, domain, host),
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
         ]
         server = _server(opened, _ready_localizer(method, setting, settings), setting.camera, sinks, loop=loop)
-        if hull_radius is not None:
-            server.watch = Watch(Passage.of(setting.station, hull_radius), drift)
-            sinks += _go_no_go_sinks(server.watch, mavlink)
-        page = _health_page(host, health_port, server)
-        stack.callback(page.close)
+        sinks += _go_no_go_sinks(server, setting, go_no_go, mavlink)
+        page = stack.enter_context(closing(_health_page(host, health_port, server)))
         # last of all, so that a start that fails leaves what is on the disk alone
         sinks += _file_sinks(setting, station_file, out, record or [], force)
         print(f"health at http://{host}:{page.port}/", file=sys.stderr if as_json else sys.stdout, flush=True)
@@ -256,14 +248,25 @@ def _vehicle_sinks(
     return workers
 
 
-def _go_no_go_sinks(watch: Watch, mavlink: str | None) -> list[Worker]:
-    """The go / no-go by MAVLink, to where the fixes go."""
+def _go_no_go_sinks(server: Server, setting: Setting, given: str | None, mavlink: str | None) -> list[Worker]:
+    """Let the server say go or no-go, and send it by MAVLink to where the fixes go."""
+    if given is None:
+        return []
+    radius_m, _, drift_m_s = given.partition(":")
+    try:
+        size, drift = float(radius_m), float(drift_m_s or DRIFT_M_S)
+    except ValueError:
+        size = drift = math.nan
+    if not (0.0 < size < math.inf and 0.0 <= drift < math.inf):
+        raise InputError(f"--go-no-go {given}: wanted M or M:M/S, as 0.35:0.1 is one")
+    server.watch = Watch(Passage.of(setting.station, size), drift)
     if mavlink is None:
         return []
     with extra("mavlink"):
         from lumidock.streams.go_no_go_link import GoNoGoLink
     name, port = _host_and_port("--mavlink", mavlink)
-    return [Worker("go-no-go", partial(GoNoGoLink, name, port, watch), queue=1, stale_s=STALE_S, pictures=False)]
+    link = partial(GoNoGoLink, name, port, server.watch)
+    return [Worker("go-no-go", link, queue=1, stale_s=STALE_S, pictures=False)]
 
 
 def _viewer_sinks(setting: Setting, foxglove_port: int | None, rerun: str | None, host: str) -> list[Worker]:
