@@ -26,11 +26,9 @@ ROWS = (
     ("docking", "rov", "aided", 10),
     ("docking-hard", "rov", "lumidock", 5),
     ("docking-hard", "rov", "aided", 5),
-    ("docking-moved", "rov", "lumidock", 10),
     ("docking", "rov", "raw", 10),
     ("docking-hard", "rov", "raw", 5),
     ("docking", "rov", "paper", 4),
-    ("docking-hard", "rov", "paper", 2),
 )
 
 
