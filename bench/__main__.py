@@ -27,6 +27,7 @@ from bench import (
     lamp_weights,
     learned_matcher,
     nominal,
+    ports,
     rendering,
     reproduced,
     speed,
@@ -37,6 +38,7 @@ from bench import (
 BENCHES = {
     "acquisition": acquisition,
     "nominal": nominal,
+    "ports": ports,
     "association": association,
     "closed-loop": closed_loop,
     "table1": table1,

@@ -85,7 +85,7 @@ def test_an_mcap_holds_what_the_run_says(run, sequence, vehicle, tmp_path):
     found, table = read_mcap(target), rows(run)
     assert set(found) == {
         *("/lumidock/pose", "/lumidock/status", "/tf", "/tf_static", "/lumidock/camera_info"),
-        *("/lumidock/image/compressed", "/lumidock/annotations"),
+        *("/lumidock/image/compressed", "/lumidock/annotations", "/lumidock/velocity"),
     }
     valid = [row for row in table if row["valid"] == "1"]
     assert len(valid) >= 3

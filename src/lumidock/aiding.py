@@ -22,33 +22,39 @@ import numpy as np
 from lumidock import track
 from lumidock._kernels.tracking.aiding import SensorRows, SensorRules, update_by_sensor
 from lumidock._kernels.tracking.bank import Bank
-from lumidock._kernels.tracking.track import CALIBRATION, LIGHTS, TWIST, FilterState
-from lumidock.config import AidingConfig, Config, DockMotionConfig
+from lumidock._kernels.tracking.track import CALIBRATION, LIGHTS, FilterState
+from lumidock.config import AidingConfig, Config
 from lumidock.datatypes import AidingMeasurement, Array, Attitude, SensorKind, SensorUse
-from lumidock.geometry import rotation_from_quat_xyzw, skew
+from lumidock.geometry import rotation_from_quat_xyzw
 from lumidock.model import StationModel
+from lumidock.sensor_models import (
+    ERRORS,
+    Before,
+    Group,
+    SensorModel,
+    declared,
+    dock_noise,
+    model_of,
+    only,
+    walk,
+)
 from lumidock.track import Track
 
-# Error states behind those of the lights: bias rad/s and delay s of the gyro; relative scale, mount rad and delay s of
-# the DVL; reading of the depth sensor at the height of the dock's origin m; x and z of the direction that is upward in
-# `dock`, whose y is 1.
-GYRO, GYRO_DELAY, SCALE, MOUNT, VELOCITY_DELAY, DEPTH, UP, ERRORS = 0, 3, 4, 5, 8, 9, 10, 12
 PROVABLE: tuple[SensorKind, ...] = ("gyro", "velocity", "depth", "tilt")  # each with a state of the bank blind to it
 MAX_BUFFER = 2000  # values that may wait for a frame: 4 s of all sensors at 100 Hz
 _LATE_S = 0.5  # a value that comes so long after the frame that it belongs before says nothing of now
 _AHEAD_S = 5.0  # one that is stamped so long after the next frame is of another clock
 _SILENT_S = 0.5  # without a value; a DVL has two in this time
-_CORRELATED_S = 1.0  # what a wrong mount makes of a rate changes as fast as the motion of a vehicle does
 _PROVEN_SHARE = 0.3  # of a declared variance, at most, that is left when the lights have measured an error
 _PROVEN_TEST = 9.0  # chi-square, 1 dof, 0.3 %, that the error then has to pass
 _PROVEN_S = 3.0  # of agreement, in which noise and delay show too
 _MATTERS = 0.01  # share of the largest variance, below which one does nothing
 _CONTRADICTION = 24.0  # chi-square, 1 dof, 1e-6
 _TOLD_SHARE = 0.02  # least share of a declared variance that measurements removed; below it nothing is told
-_JUMPS, _FORGIVEN = (
-    5.0,
-    0.25,
-)  # groups in a row that are refused before a sensor is declined; what a good one takes back
+_DRIFT_MEMORY, _MAX_DRIFT = 0.97, 4.9  # 30 groups: 6 s of a DVL; two-sided normal, 1e-6
+_DOUBTED = 2.5  # two-sided normal, 1 %: a sensor that may have begun to lie carries nothing in the dark
+_JUMPS = 5.0  # groups that are refused, more or less in a row, before a sensor is declined ...
+_FORGIVEN = 0.25  # ... and how much of that a good one takes back
 _NEVER = -(2**62)  # ns
 
 
@@ -57,7 +63,8 @@ class SensorTest:
     """How a sensor has stood up to the lights so far.
 
     `last_ns` of its last group, which had the mean `value`; `agreed_s`: how long it has agreed; `jumps`: groups refused
-    of late; `mean_deviate`: exponential mean of the innovations as normal deviates.
+    of late; `mean_deviate`: exponential mean of their NIS as normal deviates; `drift`: that of the innovations
+    themselves, number by number, which is zero for a sensor without a bias. Both are scaled to unit variance.
     """
 
     kind: SensorKind
@@ -66,6 +73,7 @@ class SensorTest:
     agreed_s: float = 0.0
     jumps: float = 0.0
     mean_deviate: float = 0.0
+    drift: tuple[float, ...] = ()
     proven: bool = False
     declined: str = ""
 
@@ -95,14 +103,19 @@ class AidingState:
         return tuple(_use(test, t_ns) for test in self.tests)
 
     def carries(self, t_ns: int) -> bool:
-        """Whether gyro and velocity are proven and not silent, so that a track lasts longer without a light."""
+        """Whether gyro and velocity are proven, heard and not in doubt: then a track lasts longer without light."""
         return all(
-            test.proven and not test.declined and not _is_silent(test, t_ns)
+            test.proven and not test.declined and not _is_silent(test, t_ns) and _most(test.drift) < _DOUBTED
             for test in (self.test_of("gyro"), self.test_of("velocity"))
         )
 
 
 NO_AIDING = AidingState()
+
+
+def _most(numbers: tuple[float, ...]) -> float:
+    """The largest size among some numbers."""
+    return max(map(abs, numbers), default=0.0)
 
 
 def _is_silent(test: SensorTest, t_ns: int) -> bool:
@@ -115,29 +128,6 @@ def _use(test: SensorTest, t_ns: int) -> SensorUse:
     if _is_silent(test, t_ns):
         return SensorUse(test.kind, "silent")
     return SensorUse(test.kind, "used" if test.proven else "proving")
-
-
-class Group(NamedTuple):
-    """The mean of some values of one sensor at their mean time, delay removed; `sigma` of its noise."""
-
-    kind: SensorKind
-    t_ns: int
-    value: tuple[float, ...]
-    sigma: float
-
-
-class _Model(NamedTuple):
-    """A group against a track's prediction: its rows in the filter and their degrees of freedom.
-
-    `errors` (K, ERRORS): what the error states do to its numbers. `parts`: those of one source, which the lights have
-    to have measured before the sensor is proven; `delay`: that of the delay, or -1.
-    """
-
-    rows: SensorRows
-    errors: Array
-    dof: int
-    parts: tuple[slice, ...]
-    delay: int = -1
 
 
 class Advanced(NamedTuple):
@@ -184,19 +174,6 @@ def max_gap_s(aiding: AidingState, t_ns: int, config: Config) -> float:
     """How long a track lasts without a light, s."""
     gap_s = config.track.max_gap_s
     return gap_s + config.aiding.max_age_s if aiding.carries(t_ns) else gap_s
-
-
-def dock_noise(dock: DockMotionConfig) -> tuple[float, float]:
-    """Variances that a second adds to the twist, (m/s)^2 and (rad/s)^2, where the dock moves: 2 sigma^2 / tau."""
-    spread = _swing_s(dock.position_m, dock.velocity_m_s), _swing_s(dock.angle_deg, dock.rate_deg_s)
-    sigma = dock.velocity_m_s, math.radians(dock.rate_deg_s)
-    linear, angular = (2.0 * s * s / tau if tau > 0.0 else 0.0 for s, tau in zip(sigma, spread, strict=True))
-    return linear, angular
-
-
-def _swing_s(amplitude: float, rate: float) -> float:
-    """Correlation time s of a swing of an amplitude and a rate."""
-    return amplitude / rate if rate > 0.0 else 0.0
 
 
 def _delay_s(kind: SensorKind, config: AidingConfig) -> float:
@@ -256,7 +233,7 @@ def _applied(
     if not tracks:
         return tracks, replace(heard, agreed_s=0.0)
     tracks = tuple(_ready(one, group, test, model, config) for one in tracks)
-    models = [model_of(one, group, test, config.aiding) for one in tracks]
+    models = [model_of(one, group, Before(test.last_ns, test.value), config.aiding) for one in tracks]
     judged = _judged(tracks[0], models[0], test, heard, config) if confirmed else heard
     if judged.declined or judged.jumps > test.jumps:
         return tracks, judged
@@ -277,7 +254,7 @@ def _ready(one: Track, group: Group, test: SensorTest, model: StationModel, conf
         one.bank.offset[subset], one.bank.P[subset] = 0.0, one.state.P
     dt = min(max((group.t_ns - test.last_ns) * 1e-9, 0.0), 10.0) if test.last_ns > _NEVER else 0.0
     at = np.arange(len(one.state.x) - ERRORS, len(one.state.x))
-    more, begun = _walk(group.kind, config.aiding) * dt, np.flatnonzero(one.bank.begun)
+    more, begun = walk(group.kind, config.aiding) * dt, np.flatnonzero(one.bank.begun)
     one.state.P[at, at] += more
     one.bank.P[begun[:, None], at, at] += more
     return one
@@ -286,30 +263,6 @@ def _ready(one: Track, group: Group, test: SensorTest, model: StationModel, conf
 def _subset(kind: SensorKind, bank: Bank) -> int:
     """The state of a bank that is blind to a sensor."""
     return len(bank.begun) - track.SENSORS + PROVABLE.index(kind)
-
-
-def declared(config: AidingConfig) -> Array:
-    """Variances (ERRORS,) of the error states as the settings have them."""
-    var = np.empty(ERRORS)
-    var[GYRO:GYRO_DELAY] = math.radians(config.gyro.bias_deg_s) ** 2
-    var[GYRO_DELAY], var[VELOCITY_DELAY] = config.gyro.delay_sigma_s**2, config.velocity.delay_sigma_s**2
-    var[SCALE] = config.velocity.scale**2
-    var[MOUNT:VELOCITY_DELAY] = math.radians(config.velocity.mount_sigma_deg) ** 2
-    var[DEPTH] = config.depth.dock_depth_sigma_m**2
-    var[UP:] = math.radians(config.dock_level_deg) ** 2
-    return var
-
-
-def _walk(kind: SensorKind, config: AidingConfig) -> Array:
-    """Variances (ERRORS,) that a second adds to the error states of one sensor."""
-    var = np.zeros(ERRORS)
-    if kind == "gyro":
-        var[GYRO:GYRO_DELAY] = math.radians(config.gyro.walk_deg_s) ** 2
-    elif kind == "velocity":
-        var[SCALE:VELOCITY_DELAY] = config.velocity.walk**2
-    elif kind == "depth":
-        var[DEPTH] = config.depth.walk_m**2
-    return var
 
 
 def widened(one: Track, model: StationModel, config: AidingConfig) -> Track:
@@ -336,7 +289,7 @@ def _update(one: Track, rows: SensorRows, kind: SensorKind, model: StationModel)
     update_by_sensor(one.state, one.bank, rows, rules)
 
 
-def _judged(one: Track, against: _Model, test: SensorTest, heard: SensorTest, config: Config) -> SensorTest:
+def _judged(one: Track, against: SensorModel, test: SensorTest, heard: SensorTest, config: Config) -> SensorTest:
     """The test after an innovation: too large a one is refused, too many refused and the sensor is declined."""
     columns, H, residual, var = against.rows
     S = H @ one.state.P[np.ix_(columns, columns)] @ H.T + np.diag(var)
@@ -346,11 +299,15 @@ def _judged(one: Track, against: _Model, test: SensorTest, heard: SensorTest, co
         jumps = test.jumps + 1.0
         return replace(heard, jumps=jumps, agreed_s=0.0, declined="jumps" if jumps >= _JUMPS else "")
     mean = track.mean_of(test.mean_deviate, deviate, how.deviate_memory)
-    lying = "noise" if mean > how.max_mean_deviate else ""
-    return replace(heard, jumps=max(test.jumps - _FORGIVEN, 0.0), mean_deviate=mean, declined=lying)
+    drift = test.drift or (0.0,) * len(residual)
+    if one.last.n_used:  # without lights a track agrees with its sensors
+        normal = (residual / np.sqrt(np.diagonal(S))).tolist()
+        drift = tuple(track.mean_of(old, new, _DRIFT_MEMORY) for old, new in zip(drift, normal, strict=True))
+    lying = "noise" if mean > how.max_mean_deviate else "bias" if _most(drift) > _MAX_DRIFT else ""
+    return replace(heard, jumps=max(test.jumps - _FORGIVEN, 0.0), mean_deviate=mean, drift=drift, declined=lying)
 
 
-def _proven(one: Track, against: _Model, before: SensorTest, test: SensorTest, config: Config) -> SensorTest:
+def _proven(one: Track, against: SensorModel, before: SensorTest, test: SensorTest, config: Config) -> SensorTest:
     """The test after an update: what the lights say of a sensor's errors, against what was declared of them.
 
     Each error's square over the variance that measurements have taken out of the declared one is chi-square of one
@@ -359,17 +316,13 @@ def _proven(one: Track, against: _Model, before: SensorTest, test: SensorTest, c
     if one.last.n_used == 0 or one.agreeing_frames == 0:  # without lights nothing contradicts a sensor
         return test
     known = [_told(one, against.errors, part, config.aiding) for part in against.parts]
-    tested = known if against.delay < 0 else [*known, _told(one, against.errors, _only(against.delay), config.aiding)]
+    tested = known if against.delay < 0 else [*known, _told(one, against.errors, only(against.delay), config.aiding)]
     if any(told.contradicts() for told in tested):
         return replace(test, declined="bias")
     since_s = (test.last_ns - before.last_ns) * 1e-9 if before.last_ns > _NEVER else 0.0
     agreed_s = test.agreed_s + min(max(since_s, 0.0), _SILENT_S)
     proven = agreed_s >= _PROVEN_S and all(told.proves() for told in known)
     return replace(test, agreed_s=agreed_s, proven=test.proven or proven)
-
-
-def _only(state: int) -> slice:
-    return slice(state, state + 1)
 
 
 class _Told(NamedTuple):
@@ -397,104 +350,3 @@ def _told(one: Track, errors: Array, part: slice, config: AidingConfig) -> _Told
     own = slice(n + part.start, n + part.stop)
     prior = np.einsum("ki,i,ki->k", E, declared(config)[part], E)
     return _Told(prior, np.einsum("ki,ij,kj->k", E, one.state.P[own, own], E), E @ one.state.x[own])
-
-
-class _Timing(NamedTuple):
-    """Rate of change of a sensor's value, its noise variance, lateness of a group s, time from group to group s."""
-
-    change: Array
-    var: float
-    late_s: float
-    dt_s: float
-
-    def repeats(self, correlated_s: float) -> float:
-        """By how much white noise has to be larger than a noise of this correlation time, to do as much in the end."""
-        return max(2.0 * correlated_s / self.dt_s, 1.0)
-
-
-def model_of(one: Track, group: Group, test: SensorTest, config: AidingConfig) -> _Model:
-    """A group against a predicted track. Beside its noise it is off by what the settings say of the dock's motion."""
-    dt = max((group.t_ns - test.last_ns) * 1e-9, 1e-3) if test.value else math.inf
-    change = np.subtract(group.value, test.value) / dt if test.value else np.zeros(len(group.value))
-    late_s = max((one.t_ns - group.t_ns) * 1e-9, 0.0)
-    timing = _Timing(change, 2.0 * group.sigma**2 / dt**2, late_s, min(dt, 1.0))
-    if group.kind == "gyro":
-        return _gyro(one, group, timing, config)
-    if group.kind == "velocity":
-        return _velocity(one, group, timing, config)
-    return _depth(one, group, timing, config) if group.kind == "depth" else _tilt(one, group, timing, config)
-
-
-def _gyro(one: Track, group: Group, timing: _Timing, config: AidingConfig) -> _Model:
-    """Rates of a while ago: z = w + bias - (delay + lateness) dw/dt, and what the dock turns."""
-    how, dock, state = config.gyro, config.dock_motion, one.state
-    n, R_cam_sensor = len(state.x) - ERRORS, rotation_from_quat_xyzw(np.array(how.quat_xyzw))
-    z, change = R_cam_sensor @ group.value, R_cam_sensor @ timing.change
-    errors = np.zeros((3, ERRORS))
-    errors[:, GYRO:GYRO_DELAY], errors[:, GYRO_DELAY] = np.eye(3), -change
-    turned = math.radians(how.mount_sigma_deg) ** 2 * float(z @ z) * timing.repeats(_CORRELATED_S)
-    rocking = math.radians(dock.rate_deg_s) ** 2 * timing.repeats(_swing_s(dock.angle_deg, dock.rate_deg_s))
-    var = group.sigma**2 + timing.var * (how.delay_sigma_s + timing.late_s) ** 2 + turned + rocking
-    columns = np.concatenate([np.arange(TWIST + 3, TWIST + 6), n + np.arange(GYRO, SCALE)])
-    expected = state.x[TWIST + 3 : TWIST + 6] + errors @ state.x[n:] - change * timing.late_s
-    rows = SensorRows(columns, np.hstack([np.eye(3), errors[:, GYRO:SCALE]]), z - expected, np.full(3, var))
-    return _Model(rows, errors, 3, (slice(GYRO, GYRO_DELAY),), GYRO_DELAY)
-
-
-def _velocity(one: Track, group: Group, timing: _Timing, config: AidingConfig) -> _Model:
-    """Velocity over ground at r, of a while ago: z = u + scale u + mount x u - (delay + lateness) du/dt; u = v + w x r.
-
-    And what the dock moves.
-    """
-    how, dock, state = config.velocity, config.dock_motion, one.state
-    n, r = len(state.x) - ERRORS, np.array(how.position_m)
-    R_cam_sensor = rotation_from_quat_xyzw(np.array(how.quat_xyzw))
-    z, change = R_cam_sensor @ group.value, R_cam_sensor @ timing.change
-    u = state.x[TWIST : TWIST + 3] + np.cross(state.x[TWIST + 3 : TWIST + 6], r)
-    M = (1.0 + state.x[n + SCALE]) * np.eye(3) + skew(state.x[n + MOUNT : n + VELOCITY_DELAY])
-    errors = np.zeros((3, ERRORS))
-    errors[:, SCALE], errors[:, MOUNT:VELOCITY_DELAY], errors[:, VELOCITY_DELAY] = u, -skew(u), -change
-    swing = _swing_s(dock.position_m, dock.velocity_m_s), _swing_s(dock.angle_deg, dock.rate_deg_s)
-    rocking = dock.velocity_m_s**2 * timing.repeats(swing[0])
-    rocking += (math.radians(dock.rate_deg_s) * float(np.linalg.norm(state.t))) ** 2 * timing.repeats(swing[1])
-    var = group.sigma**2 + timing.var * (how.delay_sigma_s + timing.late_s) ** 2 + rocking
-    columns = np.concatenate([np.arange(TWIST, TWIST + 6), n + np.arange(SCALE, DEPTH)])
-    H = np.hstack([M, -M @ skew(r), errors[:, SCALE:DEPTH]])
-    expected = u + errors @ state.x[n:] - change * timing.late_s
-    parts = _only(SCALE), slice(MOUNT, VELOCITY_DELAY)
-    return _Model(SensorRows(columns, H, z - expected, np.full(3, var)), errors, 3, parts, VELOCITY_DELAY)
-
-
-def _depth(one: Track, group: Group, timing: _Timing, config: AidingConfig) -> _Model:
-    """Depth of a sensor at r: z = depth of the dock's origin - up . p, p its position in `dock`."""
-    how, dock, state = config.depth, config.dock_motion, one.state
-    n = len(state.x) - ERRORS
-    up = np.array([state.x[n + UP], 1.0, state.x[n + UP + 1]])
-    p = state.R.T @ (np.array(how.position_m) - state.t)
-    errors = np.zeros((1, ERRORS))
-    errors[0, DEPTH], errors[0, UP:] = 1.0, -p[[0, 2]]
-    swing_s = _swing_s(dock.angle_deg, dock.rate_deg_s)
-    rocking = (math.radians(dock.angle_deg) * float(np.linalg.norm(p))) ** 2 + dock.position_m**2
-    var = group.sigma**2 + float(timing.change @ timing.change) * timing.late_s**2 + rocking * timing.repeats(swing_s)
-    columns = np.concatenate([np.arange(6), n + np.arange(DEPTH, ERRORS)])
-    H = np.concatenate([up, np.cross(p, up), errors[0, DEPTH:]])[None]
-    residual = np.array([group.value[0] - (state.x[n + DEPTH] - up @ p)])
-    return _Model(SensorRows(columns, H, residual, np.array([var])), errors, 1, (slice(DEPTH, ERRORS),))
-
-
-def _tilt(one: Track, group: Group, timing: _Timing, config: AidingConfig) -> _Model:
-    """The direction upward: z = R_cam_dock up."""
-    how, dock, state = config.tilt, config.dock_motion, one.state
-    n = len(state.x) - ERRORS
-    z = rotation_from_quat_xyzw(np.array(how.quat_xyzw)) @ group.value
-    up = np.array([state.x[n + UP], 1.0, state.x[n + UP + 1]])
-    length = float(np.linalg.norm(up))
-    up /= length
-    errors = np.zeros((3, ERRORS))
-    errors[:, UP:] = (state.R @ (np.eye(3) - np.outer(up, up)))[:, [0, 2]] / length
-    rocking = math.radians(dock.angle_deg) ** 2 * timing.repeats(_swing_s(dock.angle_deg, dock.rate_deg_s))
-    var = group.sigma**2 + float(timing.change @ timing.change) * timing.late_s**2 + rocking
-    columns = np.concatenate([np.arange(3, 6), n + np.arange(UP, ERRORS)])
-    H = np.hstack([-state.R @ skew(up), errors[:, UP:]])
-    residual = z / float(np.linalg.norm(z)) - state.R @ up
-    return _Model(SensorRows(columns, H, residual, np.full(3, var)), errors, 2, (slice(UP, ERRORS),))

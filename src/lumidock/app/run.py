@@ -18,7 +18,7 @@ from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import FrameError, InputError
 from lumidock.methods import Aided, Method
 from lumidock.streams.run_folder import RunFolder, identities
-from lumidock.streams.sensors import AidingFeed
+from lumidock.streams.sensors import AidingFeed, SensorFeed
 from lumidock.streams.source import Item, Source
 
 
@@ -120,7 +120,7 @@ def run(
     return summary
 
 
-def aid(localizer: Method, feed: AidingFeed, item: Item) -> None:
+def aid(localizer: Method, feed: SensorFeed, item: Item) -> None:
     """Give a method that makes use of them what the vehicle's sensors have said until an item."""
     if isinstance(localizer, Aided):
         for value in feed.until(item.t_ns):

@@ -21,7 +21,7 @@ from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import LumidockError
 from lumidock.go_no_go import Watch
 from lumidock.methods import Method
-from lumidock.streams.sensors import AidingFeed
+from lumidock.streams.sensors import AidingFeed, SensorFeed
 from lumidock.streams.sinks import Sink
 from lumidock.streams.source import Item
 
@@ -260,7 +260,7 @@ class Server:
     arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
     latency_us: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
     last: Fix | None = None
-    feed: AidingFeed = field(default_factory=lambda: AidingFeed(()))
+    feed: SensorFeed = field(default_factory=lambda: AidingFeed(()))
     watch: Watch | None = None  # of the go / no-go
     started_s: float = field(default_factory=time.monotonic)
 

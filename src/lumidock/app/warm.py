@@ -15,7 +15,7 @@ from lumidock import detect, layers
 from lumidock._kernels import compiling
 from lumidock.camera import Camera
 from lumidock.config import Config
-from lumidock.datatypes import Array, Attitude, Detections, Fix, Frame
+from lumidock.datatypes import AidingMeasurement, Array, Attitude, Detections, Fix, Frame
 from lumidock.geometry import se3_inverse, transform_points
 from lumidock.localizer import Localizer
 from lumidock.station import Station
@@ -89,6 +89,7 @@ def _matching(station: Station, camera: Camera) -> None:
     localizer, head_on = Localizer(station, camera), Attitude(np.diag([1.0, -1.0, -1.0]), _SENSOR_RAD)
     for k in range(_FRAMES):
         found = Detections.from_uv(str(k), k * _STEP_NS, _view(station, camera, k))
+        localizer.aid(AidingMeasurement("gyro", k * _STEP_NS, (0.0, 0.0, 0.0), _SENSOR_RAD))
         localizer.process_detections(replace(found, attitude=head_on) if k == _FRAMES - 1 else found)
 
 

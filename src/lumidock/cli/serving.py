@@ -57,7 +57,7 @@ from lumidock.go_no_go import DRIFT_M_S, Passage, Watch
 from lumidock.methods import localizer_of, require_method
 from lumidock.station import load_station
 from lumidock.streams.healthpage import HealthPage
-from lumidock.streams.sensors import AidingFeed
+from lumidock.streams.sensors import AidingFeed, SensorFeed
 from lumidock.streams.sinks import FILE_KINDS, Numbered, RunSink, Setting, open_rerun
 from lumidock.streams.source import Reading, Source
 from lumidock.streams.vehicle import load_vehicle
@@ -85,6 +85,12 @@ GoNoGoOption = Annotated[
         metavar="M[:M/S]",
         help="Say go, hold or abort, in health and by MAVLink, to a vehicle of this cross-section radius that "
         f"may move so fast unnoticed; {DRIFT_M_S:g} m/s unless given.",
+    ),
+]
+SensorsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--sensors", metavar="HOST:PORT", help="Listen there for ATTITUDE and VISION_POSITION_DELTA by UDP, as aiding."
     ),
 ]
 ZenohOption = Annotated[
@@ -132,6 +138,7 @@ def _serve(
     loop: Annotated[bool, typer.Option("--loop", help="Show a recording again and again.")] = False,
     mavlink: MavlinkOption = None,
     go_no_go: GoNoGoOption = None,
+    sensors: SensorsOption = None,
     zenoh: ZenohOption = None,
     dds: Annotated[bool, typer.Option("--dds", help="Publish to ROS 2 by DDS.")] = False,
     domain: Annotated[int, typer.Option(metavar="N", min=0, max=232, help="ROS_DOMAIN_ID.")] = 0,
@@ -150,8 +157,8 @@ def _serve(
     settings = load_config(config) if config else Config()
     with ExitStack() as stack:
         if source.startswith(SIM):
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            source = str(simulated(source, folder / "sequence", station, camera))
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "sequence"
+            source = str(simulated(source, folder, station, camera))
         reading = Reading(fps, topic, info_topic, bits, as_stored=as_stored, trusted=trust_calibration)
         reading = replace(reading, follow_calibration=camera is None)
         opened = open_any(source, reading, delay_ms=delay_ms, station=station)
@@ -164,6 +171,7 @@ def _serve(
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host),
         ]
         server = _server(opened, _ready_localizer(method, setting, settings), setting.camera, sinks, loop=loop)
+        server.feed = _sensor_feed(stack, opened, sensors)
         sinks += _go_no_go_sinks(server, setting, go_no_go, mavlink)
         page = stack.enter_context(closing(_health_page(host, health_port, server)))
         # last of all, so that a start that fails leaves what is on the disk alone
@@ -171,9 +179,7 @@ def _serve(
         print(f"health at http://{host}:{page.port}/", file=sys.stderr if as_json else sys.stdout, flush=True)
         with _stopped_by_signals(server.stop):
             server.serve()
-    _print_counts(server, as_json)
-    if server.camera.problem and not opened.live:
-        raise InputError(server.camera.problem)
+    _print_end(server, as_json, live=opened.live)
 
 
 def _ready_localizer(name: str, setting: Setting, settings: Config) -> methods.Method:
@@ -190,16 +196,18 @@ def _server(opened: Source, localizer: methods.Method, lens: Camera, sinks: list
     stop, newest = threading.Event(), Newest()
     read = partial(opened.items, (lens.width, lens.height))
     reader = SourceReader(read, newest, live=opened.live, loop=loop, stop=stop)
-    return Server(localizer, reader, newest, sinks, stop, feed=AidingFeed(opened.sensors()))
+    return Server(localizer, reader, newest, sinks, stop)
 
 
-def _print_counts(server: Server, as_json: bool) -> None:
-    """The counts of all that was served, for people or as JSON."""
+def _print_end(server: Server, as_json: bool, *, live: bool) -> None:
+    """The counts of all that was served, for people or as JSON. Raises: InputError when a recording ended badly."""
     counts, dropped = server.counts, server.newest.dropped
     if as_json:
         print(json.dumps({word: counts[word] for word in ("frames", "valid", "guide")} | {"dropped": dropped}))
     else:
         print(f"{counts['frames']} frames: {counts['valid']} valid; {dropped} came too fast and were dropped")
+    if server.camera.problem and not live:
+        raise InputError(server.camera.problem)
 
 
 def _health_page(host: str, port: int, server: Server) -> HealthPage:
@@ -267,6 +275,21 @@ def _go_no_go_sinks(server: Server, setting: Setting, given: str | None, mavlink
     name, port = _host_and_port("--mavlink", mavlink)
     link = partial(GoNoGoLink, name, port, server.watch)
     return [Worker("go-no-go", link, queue=1, stale_s=STALE_S, pictures=False)]
+
+
+def _sensor_feed(stack: ExitStack, opened: Source, sensors: str | None) -> SensorFeed:
+    """The sensors of an autopilot, until the stack is closed; else those of a recording."""
+    if sensors is None:
+        return AidingFeed(opened.sensors())
+    with extra("mavlink"):
+        from lumidock.streams.mavlink_sensors import MavlinkSensors
+    host, port = _host_and_port("--sensors", sensors)
+    try:
+        feed = MavlinkSensors(host, port)
+    except OSError as error:
+        raise InputError(f"--sensors {sensors}: {error.strerror or error}") from None
+    stack.callback(feed.close)
+    return feed
 
 
 def _viewer_sinks(setting: Setting, foxglove_port: int | None, rerun: str | None, host: str) -> list[Worker]:

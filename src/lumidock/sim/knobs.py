@@ -267,10 +267,10 @@ class StreamFaults(KnobSection):
 
 
 class SensorKnobs(KnobSection):
-    """One sensor of the vehicle and its errors, in rad/s (gyro), m/s (DVL), m (depth) or parts of 1 (tilt)."""
+    """Errors of a sensor of the vehicle, in rad/s (gyro), m/s (DVL), m (depth) or parts of 1 (tilt)."""
 
-    rate_hz: Annotated[float, Field(ge=0.1, le=100.0)]
-    noise: Annotated[float, Field(ge=1e-9, le=1e3)]  # 1 sigma of each number, independent from value to value
+    rate_hz: Annotated[float, Field(ge=0.1, le=100.0)] = 10.0
+    noise: Annotated[float, Field(ge=1e-9, le=1e3)] = 0.01  # 1 sigma of each number, independent from value to value
     bias: Annotated[float, Field(ge=0.0, le=1e3)] = 0.0  # 1 sigma of each number, drawn once a run
     scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0  # 1 sigma of the relative error, drawn once a run
     mount_deg: Angle = 0.0  # by which it is turned about an axis that is drawn once a run
@@ -280,18 +280,43 @@ class SensorKnobs(KnobSection):
     wrong_scale: float = 0.0  # ... and this relative error
 
 
-def _sensor(**defaults: float) -> Any:  # noqa: ANN401  # what pydantic calls before it reads a section
-    """Fill in what a scenario does not say of a sensor."""
-    return BeforeValidator(lambda given: defaults | given if isinstance(given, dict) else given)
+class GyroKnobs(SensorKnobs):
+    """A gyro with the errors that the localizer's settings declare."""
+
+    rate_hz: Annotated[float, Field(ge=0.1, le=100.0)] = 50.0
+    noise: Annotated[float, Field(ge=1e-9, le=1e3)] = 0.001  # rad/s
+    bias: Annotated[float, Field(ge=0.0, le=1e3)] = 0.0052  # rad/s: 0.3 degrees/s
+
+
+class DvlKnobs(SensorKnobs):
+    """A DVL with the errors that the localizer's settings declare."""
+
+    rate_hz: Annotated[float, Field(ge=0.1, le=100.0)] = 5.0
+    scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.03
+    mount_deg: Angle = 2.0
+
+
+class DepthKnobs(SensorKnobs):
+    """A depth sensor, above or below the depth of the dock by what its bias says."""
+
+    bias: Annotated[float, Field(ge=0.0, le=1e3)] = 2.0  # m
+
+
+class TiltKnobs(SensorKnobs):
+    """A sensor of the direction upward."""
+
+    rate_hz: Annotated[float, Field(ge=0.1, le=100.0)] = 20.0
+    noise: Annotated[float, Field(ge=1e-9, le=1e3)] = 0.005
+    mount_deg: Angle = 1.0
 
 
 class AidingKnobs(KnobSection):
-    """The vehicle's own sensors; none unless given, `{}` for one with the errors that the localizer's settings hold."""
+    """The vehicle's own sensors: none unless given, `{}` for one with its defaults."""
 
-    gyro: Annotated[SensorKnobs | None, _sensor(rate_hz=50.0, noise=0.001, bias=0.0052)] = None  # bias 0.3 degrees/s
-    velocity: Annotated[SensorKnobs | None, _sensor(rate_hz=5.0, noise=0.01, scale=0.03, mount_deg=2.0)] = None
-    depth: Annotated[SensorKnobs | None, _sensor(rate_hz=10.0, noise=0.01, bias=2.0)] = None
-    tilt: Annotated[SensorKnobs | None, _sensor(rate_hz=20.0, noise=0.005, mount_deg=1.0)] = None
+    gyro: GyroKnobs | None = None
+    velocity: DvlKnobs | None = None
+    depth: DepthKnobs | None = None
+    tilt: TiltKnobs | None = None
 
 
 class DockingKnobs(KnobSection):

@@ -15,7 +15,7 @@ from lumidock.streams.run_folder import FIX_COLUMNS
 
 _TYPES = {
     **dict.fromkeys(FIX_COLUMNS, pa.float64()),
-    **dict.fromkeys(("frame", "status", "stage", "reason"), pa.string()),
+    **dict.fromkeys(("frame", "status", "stage", "reason", "aiding"), pa.string()),
     **dict.fromkeys(("valid", "guide"), pa.bool_()),
     **dict.fromkeys(("t_ns", "latency_us"), pa.int64()),
     **dict.fromkeys(("n_seen", "n_used"), pa.int32()),

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from lumidock.camera import Camera
-from lumidock.datatypes import Array, Detections, Fix, Frame, Unusable
+from lumidock.datatypes import Array, Detections, Fix, Frame, Unusable, Velocity
 from lumidock.geometry import quat_xyzw_from_rotation, se3_inverse
 from lumidock.streams.jpeg import jpeg_of
 from lumidock.streams.vehicle import Vehicle
@@ -68,6 +68,7 @@ _DEFINITIONS = {
 PREFIX = "/lumidock"
 TYPES = {
     f"{PREFIX}/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    f"{PREFIX}/velocity": "geometry_msgs/msg/TwistWithCovarianceStamped",
     f"{PREFIX}/status": "lumidock_msgs/msg/Status",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
@@ -117,7 +118,7 @@ def messages(
     *,
     picture: bool = True,
 ) -> Iterator[Serialized]:
-    """The messages of one frame; a pose and its transform only where the pose is valid."""
+    """The messages of one frame: a pose and its transform only where that is valid, a velocity where it is known."""
     frames = _Frames.of(vehicle)
     if item.t_ns is None:
         return
@@ -127,6 +128,8 @@ def messages(
         yield _serialized(f"{PREFIX}/pose", t_ns, _pose_stamped(fix, t_ns, frames))
         transform = _transform(frames.dock, frames.camera, t_ns, fix.T_dock_cam)
         yield _serialized("/tf", t_ns, _make("tf2_msgs/msg/TFMessage", [transform]))
+    if fix.velocity is not None:
+        yield _serialized(f"{PREFIX}/velocity", t_ns, _twist_stamped(fix.velocity, t_ns, frames))
     if picture and isinstance(item, Frame):
         if camera.port is None:  # CameraInfo has no words for a port
             yield _serialized(f"{PREFIX}/camera_info", t_ns, _camera_info(camera, t_ns, frames))
@@ -189,6 +192,16 @@ def _pose_stamped(fix: Fix, t_ns: int, frames: _Frames) -> Any:  # noqa: ANN401
     pose = _make("geometry_msgs/msg/Pose", position, _quaternion(fix.T_dock_cam))
     with_covariance = _make("geometry_msgs/msg/PoseWithCovariance", pose, covariance)
     return _make("geometry_msgs/msg/PoseWithCovarianceStamped", _header(t_ns, frames.dock), with_covariance)
+
+
+def _twist_stamped(velocity: Velocity, t_ns: int, frames: _Frames) -> Any:  # noqa: ANN401
+    linear, angular = (
+        _make("geometry_msgs/msg/Vector3", *map(float, vector))
+        for vector in (velocity.linear_m_s, velocity.angular_rad_s)
+    )
+    twist = _make("geometry_msgs/msg/Twist", linear, angular)
+    with_covariance = _make("geometry_msgs/msg/TwistWithCovariance", twist, velocity.covariance.reshape(36))
+    return _make("geometry_msgs/msg/TwistWithCovarianceStamped", _header(t_ns, frames.camera), with_covariance)
 
 
 def _quaternion(T: Array) -> Any:  # noqa: ANN401

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import get_args
+from typing import Protocol, get_args
 
 from lumidock.datatypes import SENSOR_VALUES, AidingMeasurement, SensorKind
 from lumidock.errors import DataError, InputError
@@ -13,6 +13,14 @@ from lumidock.errors import DataError, InputError
 AIDING_COLUMNS = ("t_ns", "kind", "v0", "v1", "v2", "v3", "sigma")
 _MAX_STAMP = 2**63 - 1
 _KINDS: tuple[SensorKind, ...] = get_args(SensorKind)
+
+
+class SensorFeed(Protocol):
+    """What gives the vehicle's own sensors to a localizer."""
+
+    def until(self, t_ns: int | None) -> Iterator[AidingMeasurement]:
+        """The values that are there and have not been handed out, at least those up to the frame at `t_ns`."""
+        ...
 
 
 class AidingFeed:
