@@ -13,8 +13,10 @@ from pathlib import Path
 
 from bench import (
     acquisition,
+    acquisition_time,
     aiding,
     association,
+    bank,
     closed_loop,
     configuration,
     contact_sheet,
@@ -37,6 +39,8 @@ from bench import (
 
 BENCHES = {
     "acquisition": acquisition,
+    "acquisition-time": acquisition_time,
+    "bank": bank,
     "nominal": nominal,
     "ports": ports,
     "association": association,

@@ -47,8 +47,14 @@ def follow(history, lights, attitude=None):
 
 
 def blind(one, light):
-    """Pose T_cam_dock (4, 4) and the pose's covariance (6, 6) of the state that never saw a light."""
-    return one.T_cam_dock @ se3_exp(one.bank.offset[light, :6]), one.bank.P[light, :6, :6]
+    """Pose T_cam_dock (4, 4) and the pose's covariance (6, 6) of the state that never saw a light, nor its group."""
+    s = MODEL.group[light]
+    return one.T_cam_dock @ se3_exp(one.bank.offset[s, :6]), one.bank.P[s, :6, :6]
+
+
+def without(lights, light):
+    """Those `lights` that the state sees which is blind to `light`."""
+    return lights[MODEL.group[lights] != MODEL.group[light]]
 
 
 @pytest.mark.parametrize(("lights", "frames"), [(BOTH, 1), (BOTH, 25), (FRONT, 1)])
@@ -59,7 +65,7 @@ def test_a_state_of_the_bank_is_a_filter_that_never_saw_its_light(lights, frames
     one = follow(history, lights, attitude if sensor else None)
     assert np.array_equal(np.flatnonzero(one.bank.used), lights)
     for light in lights[::3]:
-        less = follow(history, lights[lights != light], attitude if sensor else None)
+        less = follow(history, without(lights, light), attitude if sensor else None)
         T_cam_dock, P = blind(one, light)
         sigma = np.sqrt(np.diagonal(less.state.P)[:6])
         apart = claims.pose_error(se3_inverse(T_cam_dock), se3_inverse(less.T_cam_dock))
@@ -72,6 +78,12 @@ def in_dock(one):
     return integrity.bounds([replace(one, bank=open_bank(MODEL))], MODEL, CONFIG.integrity).covariance
 
 
+def test_lights_of_one_layer_share_no_state():
+    for layer in range(MODEL.n_layers):
+        group = MODEL.group[MODEL.layer == layer]
+        assert len(set(group)) == len(group)
+
+
 def test_a_light_that_is_used_late_is_left_out_from_then_on(rng):
     history = list(approach(rng, 6))
     one = follow(history[:-1], FRONT)
@@ -81,7 +93,7 @@ def test_a_light_that_is_used_late_is_left_out_from_then_on(rng):
     T_cam_dock, _ = blind(both, 7)
     less = track.update(
         track.predict(one, 5 * STEP_NS, CONFIG.track),
-        own(BOTH[BOTH != 7]),
+        own(without(BOTH, 7)),
         measured(history[-1][1]),
         MODEL,
         CONFIG.track,

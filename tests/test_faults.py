@@ -153,7 +153,7 @@ def test_a_frame_that_leaves_its_answer_open_lists_the_poses_that_fit(rng):
         {"integrity": {"max_age_s": 6.0}},
         {"track": {"max_gap_s": 20.0}},
         {"match": {"noise_px": 1e-3}},
-        {"match": {"max_pairs": 10**9}},
+        {"match": {"max_work": 10**9}},
         {"track": {"hypotheses": 10_000}},
     ],
 )

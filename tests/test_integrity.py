@@ -141,10 +141,10 @@ def test_levels_hold_every_other_hypothesis_that_is_not_out_of_the_question(rng)
 
 def bank_with(light, offset, P6, *, proven=False):
     """A bank in which only the state that is blind to one light has begun: `offset` (6,) off, of covariance `P6`."""
-    bank = track.open_bank(MODEL)
-    bank.begun[light], bank.offset[light, :6] = 1, offset
-    bank.P[light] = 0.0
-    bank.P[light, :6, :6] = P6
+    bank, s = track.open_bank(MODEL), MODEL.group[light]
+    bank.begun[s], bank.offset[s, :6] = 1, offset
+    bank.P[s] = 0.0
+    bank.P[s, :6, :6] = P6
     return bank._replace(used=np.eye(M, dtype=np.int64)[light], proven=np.eye(M, dtype=np.int64)[light] * proven)
 
 

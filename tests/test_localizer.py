@@ -406,9 +406,9 @@ def test_a_station_of_more_lights_than_the_filter_carries_is_refused():
 
 @pytest.mark.parametrize("measured", [False, True])
 def test_a_ring_of_one_layer_works_with_what_tells_its_roll(measured, rng):
-    """A regular ring looks the same after an eighth of a turn: only the attitude names its lights."""
+    """A regular ring looks the same after an eighth of a turn: only a sensor, or a vehicle that cannot roll, tells."""
     station, sigma = ring(8), np.deg2rad(2.0)
-    config = Config.model_validate({"prior": {"roll_deg": 4.0}})
+    config = Config.model_validate({"prior": {"roll_deg": 4.0, "any_roll": 1e-6}})
     localizer, used = Localizer(station, CAMERA, config), 0
     roll = 100.0 if measured else 3.0
     R_dock_cam = HEAD_ON @ Rotation.from_euler("z", roll, degrees=True).as_matrix()

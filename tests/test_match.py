@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from tracks import CAMERA, CONFIG, MODEL, STATION, M
 
 from lumidock import match, verify
+from lumidock.config import Config
 from lumidock.datatypes import Attitude, Detections
 from lumidock.geometry import se3_inverse
 from lumidock.model import attitude_prior, light_of, measurements
@@ -154,9 +155,10 @@ def test_a_measured_attitude_names_a_rolled_camera(roll_deg, rng):
         assert answer(found)
         assert wrong(found.hypotheses[0].assignment, order) == 0
         assert (found.hypotheses[0].assignment >= 0).sum() == 7
-        # the prior about head-on does not allow it: nothing, rather than another association
+        # without a sensor any roll is unlikely, but an array without symmetry fits in no other
         without = acquire(replace(seen, attitude=None))
-        assert not answer(without)
+        assert answer(without)
+        assert wrong(without.hypotheses[0].assignment, order) == 0
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
@@ -187,6 +189,27 @@ def test_detections_that_hardly_look_like_lamps_stay_out(rng):
 def test_a_frame_of_more_lamps_than_can_be_looked_at_is_no_answer(rng):
     found = acquire(Detections.from_uv("f", 0, rng.uniform(0, 2000, (199, 2))))
     assert (found.reason, found.hypotheses) == ("too_many", ())
+
+
+@pytest.mark.parametrize("junk", [0, 12, 30])
+def test_bounded_work_gives_the_answer_of_the_whole_search_or_none(junk, rng):
+    """What is left unsearched never changes an answer that is given."""
+    T_dock_cam = pose(HEAD_ON, [0.2, -0.3, 9.0])
+    lights = np.flatnonzero(rng.random(M) < 0.8)
+    uv = seen_from(T_dock_cam, lights, rng).uv
+    seen = Detections.from_uv("f", 0, np.concatenate([uv, rng.uniform(0, 2000, (junk, 2))]))
+    whole = acquire(seen, Config.model_validate({"match": {"max_work": 400_000}}))
+    assert answer(whole)
+    given = 0
+    for work in (1, 30, 100, 300, 1000, 3000, 10_000, 30_000, 100_000):
+        found = acquire(seen, Config.model_validate({"match": {"max_work": work}}))
+        if answer(found):
+            given += 1
+            assert_array_equal(found.hypotheses[0].assignment, whole.hypotheses[0].assignment)
+            assert_close(found.margin, whole.margin, atol=1e-9)
+        else:
+            assert found.reason == "too_many"
+    assert given > 0
 
 
 def test_detections_at_one_place_or_in_a_line_are_refused_quietly():

@@ -18,7 +18,9 @@ from lumidock.streams.run_folder import RunFolder, identities, sha256
 COLUMNS = (
     "frame,t_ns,valid,guide,status,stage,n_seen,n_used,x_m,y_m,z_m,qx,qy,qz,qw,"
     "c00,c01,c02,c03,c04,c05,c11,c12,c13,c14,c15,c22,c23,c24,c25,c33,c34,c35,c44,c45,c55,"
-    "pl_lateral_m,pl_axial_m,pl_angle_rad,bearing_x_rad,bearing_y_rad,range_m,pl_bearing_rad,pl_range_m,reason,latency_us"
+    "pl_lateral_m,pl_axial_m,pl_angle_rad,bearing_x_rad,bearing_y_rad,range_m,pl_bearing_rad,pl_range_m,reason,latency_us,"
+    "vx_m_s,vy_m_s,vz_m_s,wx_rad_s,wy_rad_s,wz_rad_s,"
+    "sigma_vx_m_s,sigma_vy_m_s,sigma_vz_m_s,sigma_wx_rad_s,sigma_wy_rad_s,sigma_wz_rad_s,aiding"
 )
 HALF = np.sqrt(0.5)
 T_DOCK_CAM = pose_from_quat(np.array([1.0, -2.0, 10.0]), np.array([HALF, 0.0, 0.0, HALF]))

@@ -49,6 +49,24 @@ def test_a_square_of_lights_fails_for_its_mirror_image(tmp_path):
     assert any("mirror image of L0 L1 L2 L3 taken for" in text and "fits within 0.00 px" in text for text in failed)
 
 
+def test_a_ring_is_unsafe_beyond_half_the_step_of_its_lights(lumidock, tmp_path):
+    angle = np.arange(8) * np.pi / 4
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], axis=1)
+    result = inspect_station(dock(tmp_path / "a.yaml", ring), LENS, Config(), REQUIRED)
+    assert_close(result["unsafe_roll_deg"], 22.5, atol=1e-6)
+    kinds = {row["kind"] for row in result["self_fits"]}
+    assert kinds == {"rotation", "mirror"}
+    _, out, _ = lumidock("station", "check", tmp_path / "a.yaml")
+    assert "unsafe beyond 22.5 degrees of roll without an attitude sensor" in out
+    assert "turned by 45.0 degrees" in out.replace("-45.0", "45.0")
+
+
+def test_the_shipped_cage_fits_itself_nowhere_else(lumidock):
+    _, out, _ = lumidock("station", "check", CAGE)
+    assert "nowhere else" in out
+    assert "unsafe" not in out
+
+
 def test_a_wide_dock_goes_dark_up_close(tmp_path):
     wide = [[3, 2.7, 0], [-3, 2.2, 0], [-2.6, -2.4, 0], [3.1, -1.9, 0], [0.7, 2.9, 0]]
     failed = inspect_station(dock(tmp_path / "a.yaml", wide), LENS, Config(), REQUIRED)["failed"]

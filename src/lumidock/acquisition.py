@@ -15,7 +15,7 @@ from lumidock.state import Context, LocalizerState
 from lumidock.track import CalibrationStates, Track
 from lumidock.tracking import likeliest
 
-_MAX_RIVALS = 8  # contradicting hypotheses that are followed beside an answer
+_MAX_RIVALS = 16  # contradicting hypotheses that are followed beside an answer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,8 +35,10 @@ class Moment:
 
     def shows_twin(self, assignment: Indices) -> bool:
         """Whether the detections that an association leaves over are another array of the same layout."""
+        if self.context.station.dock_exclusive:
+            return False
         frame = match.without(self.frame, assignment)
-        if self.context.station.dock_exclusive or model.count_lamps(frame) < CHECKED_LIGHTS:
+        if model.count_lamps(frame) < CHECKED_LIGHTS:
             return False
         config, prior = self.context.config, attitude_prior(self.attitude, self.context.config.prior)
         twin = match.acquire(frame, self.context.model, self.context.camera, prior, config.match)
@@ -53,7 +55,7 @@ class Moment:
             context.model,
             config.track,
             t_ns=self.t_ns,
-            prior=attitude_prior(self.attitude, config.prior),
+            prior=attitude_prior(self.attitude, config.prior).about(hypothesis.R, config.match.roll_gate),
             calibration=calibration or track.calibration_prior(context.station, self.attitude),
         )
 

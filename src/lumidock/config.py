@@ -13,7 +13,7 @@ PositiveFloat = Annotated[float, Field(ge=1e-12, le=1e9)]  # its square, and one
 Risk = Annotated[float, Field(ge=1e-12, le=1e-2)]  # a larger one protects nothing, a smaller one no normal tail backs
 Age = Annotated[float, Field(gt=0.0, le=5.0)]  # s; after it the vehicle's motion is anyone's guess
 NoisePx = Annotated[float, Field(ge=0.05, le=100.0)]  # no detector is better than a twentieth of a pixel
-Pairs = Annotated[int, Field(ge=1, le=10_000_000)]  # 15 s of search
+Work = Annotated[int, Field(ge=1, le=10_000_000)]  # 15 s of search
 Hypotheses = Annotated[int, Field(ge=1, le=256)]  # each holds a bank of covariances, 0.4 MB with 13 lights
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Hue = Annotated[int, Field(ge=0, le=179)]
@@ -219,6 +219,8 @@ class PriorConfig(SettingsGroup):
     roll_deg: PositiveFloat = 10.0
     pitch_deg: PositiveFloat = 15.0
     yaw_deg: PositiveFloat = 15.0
+    # share of approaches with any roll, beyond `match.roll_gate`; poses that fit there are rivals of this weight
+    any_roll: Annotated[float, Field(ge=1e-6, le=0.5)] = 1e-3
 
 
 class MatchConfig(SettingsGroup):
@@ -238,14 +240,16 @@ class MatchConfig(SettingsGroup):
     gate: PositiveFloat = 18.4  # squared Mahalanobis distance: chi-square, 2 dof, exceeded with 1e-4
     pair_gate: PositiveFloat = 11.8  # the same for a light predicted from two others and the attitude; 0.3 %
     bend: PositiveFloat = 0.7  # a tilt of variance s shortens the array by a share of this times s, 1 sigma
-    roll_gate: PositiveFloat = 3.3  # sigmas of the prior by which a candidate may be rolled
+    roll_gate: PositiveFloat = 3.3  # sigmas of the prior, beyond which a roll counts as any
     near_m: PositiveFloat = 0.3  # least and ...
     far_m: PositiveFloat = 40.0  # ... greatest distance of a light
     hypotheses: Hypotheses = 64  # kept while lights are added to them
     # of more detections only the likeliest lamps are considered: so many, or `detections_per_light` times the lights
     least_detections: PositiveInt = 16
     detections_per_light: PositiveInt = 2
-    max_pairs: Pairs = 40_000  # of detections, 1.5 us each; a frame that needs more is refused: `too_many`
+    # units of work of one frame's acquisition, a pose of two detections or a quarter of a fit, 1.4 us each (bench
+    # `acquisition-time`); what is found before all is searched is no answer: `too_many`
+    max_work: Work = 18_000
     log_dock: float = 2.0  # log prior odds that the dock is in view at all
     max_detections_three: PositiveInt = 14  # among more detections, three lights of a layer identify nothing
     sure: PositiveFloat = 15.0  # log evidence above which associations of three lights a layer are not searched for
@@ -268,7 +272,7 @@ class TrackConfig(SettingsGroup):
     start_rad_s: PositiveFloat = 0.15  # 1 sigma of the unknown rotation rate at the start
     gate: PositiveFloat = 18.4  # squared Mahalanobis distance: chi-square, 2 dof, exceeded with 1e-4
     reach: PositiveFloat = 10.0  # log evidence behind the best at which an association is not followed
-    max_nodes: Pairs = 100_000  # of the association's search, 0.1 us each; a hypothesis that needs more is dropped
+    max_nodes: Work = 100_000  # of the association's search, 0.1 us each; a hypothesis that needs more is dropped
     log_appear: float = -6.9  # log prior that a layer comes into view in one frame
     # 1 sigma to which the others predict a light that geometry proves; glints lie 2 cm and more beside the lamps
     proven_m: Annotated[float, Field(ge=1e-6, le=0.05)] = 0.01

@@ -180,13 +180,15 @@ def assess(
         n_seen=len(detections),
         n_used=used,
         T_dock_cam=bound.T_dock_cam if valid else None,
-        reason="" if valid else doubt or "protection",
+        reason="" if valid else doubt or _why_wide(state, config),
         match=Match(detections, light_of(first.last.assignment, len(detections))),
         covariance=bound.covariance if valid else None,
         protection=bound.protection if valid else None,
         guide=bound.guide if not doubt and guide_holds(bound, limits) else None,
         nis=first.last.nis / (2 * used) if status == "tracking" else math.nan,
-        alternatives=alternatives(state.hypotheses) if doubt in _OPEN else (),
+        alternatives=alternatives(state.hypotheses)
+        if not valid and (doubt or _why_wide(state, config)) in _OPEN
+        else (),
         aiding=state.aiding.uses(detections.t_ns),
     )
     return (replace(fix, velocity=velocity(first)) if fix.valid or fix.guide else fix), state
@@ -196,6 +198,13 @@ def velocity(track: Track) -> Velocity:
     """The motion of `cam` as a track has it."""
     x, both = track.state.x, slice(TWIST, TWIST + 6)
     return Velocity(x[TWIST : TWIST + 3].copy(), x[TWIST + 3 : TWIST + 6].copy(), track.state.P[both, both].copy())
+
+
+def _why_wide(state: LocalizerState, config: IntegrityConfig) -> str:
+    """The word for levels that are too wide: another association that has to be held possible, or few lights."""
+    first, *others = state.hypotheses
+    rivals = [one for one in others if first.log_weight - one.log_weight < -math.log(config.risk)]
+    return "ambiguous" if any(contradict(first.last.assignment, r.last.assignment) for r in rivals) else "protection"
 
 
 def alternatives(tracks: Sequence[Track]) -> tuple[Alternative, ...]:

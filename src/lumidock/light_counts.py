@@ -16,8 +16,8 @@ LAYER_LIGHTS = 3
 JOINT_TRACK_LIGHTS = 1
 """A track that has seen two layers together knows its tilt, and may live on a single light."""
 
-MAX_SUBSETS = 16
-"""A tracked frame costs some 30 us for each subset; a dock of more lights loses little when they go in groups."""
+MAX_SUBSETS = 8
+"""A tracked frame costs some 40 us for each. Lights of two layers share one: with one layer in view nothing is lost."""
 
 MAX_LIGHTS = 128
 """Of a station: the filter carries three states a light, and a covariance of (18 + 3 * 128)^2 numbers is 1.3 MB."""

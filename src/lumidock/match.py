@@ -37,12 +37,15 @@ from lumidock.camera import Camera
 from lumidock.config import MatchConfig
 from lumidock.datatypes import Array, Indices
 from lumidock.light_counts import CHECKED_LIGHTS, LAYER_LIGHTS, POSE_LIGHTS
-from lumidock.model import LEAST_P_LIGHT, AttitudePrior, StationModel, light_of, weights
+from lumidock.model import LEAST_P_LIGHT, P_LAMP, AttitudePrior, StationModel, light_of, weights
 
 _LEVEL, _UPRIGHT = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])  # images in surface or floor; in a wall
 _NONE = -HUGE  # log evidence of what is impossible
 _MAX_RELABELLINGS = 4  # each betters the evidence; more than two have not been seen
 _OPEN_ROLL_RAD = math.radians(45.0)  # 1 sigma; of a roll less known than this a steady vehicle says nothing
+_ANY_COSINE = 2.0  # of a roll that nothing bounds; so is its negative
+_FEW = 10  # detections, among which four lights at any roll are searched for in a few ms
+_SPARE = 2  # lights of the best that a turned array may do without: they may be clutter that fits by chance
 _AROUND = 0.25  # of the width of the assigned detections: how far around them others crowd
 
 
@@ -91,6 +94,11 @@ class _Search:
     model: StationModel
     config: MatchConfig
 
+    @property
+    def expects_roll(self) -> bool:
+        """Whether it is about the expected roll, rather than about any other."""
+        return self.problem.rules.roll_cosines[0] == _ANY_COSINE
+
     def mirrored(self, by: Array) -> Problem:
         """The problem with the lights as a mirror shows them that turns the axes of the dock `by` (3,)."""
         return self.problem._replace(p=self.problem.p * by, axis=self.problem.axis * by)
@@ -116,13 +124,85 @@ def acquire(
         return _renumbered(acquire(part, model, camera, prior, config, all_mirrors=all_mirrors), likely)
     task = _Search(_problem(frame, model, camera, prior, config), model, config)
     found, complete = _search(task, task.problem, POSE_LIGHTS, CHECKED_LIGHTS, POSE_LIGHTS)
+    tasks = [task]
+    if complete and prior.any_roll > 0.0 and config.roll_gate * prior.roll_rad < math.pi:
+        rolled = _Search(_rolled(task.problem, prior), model, config)
+        more, complete = _rivals_of_any_roll(rolled, found)
+        better = len(more.log_evidence) and more.log_evidence[0] > found.log_evidence.max(initial=_NONE)
+        tasks, found = [rolled, task] if better else [task, rolled], _merged(found, more)
     if not complete:
         return Acquisition((), (), 0.0, "too_many")
     if not len(found.log_evidence):
         return Acquisition((), (), 0.0, "too_few" if len(frame.uv) < POSE_LIGHTS else "ambiguous")
     first = Hypothesis(found.assignments[0], found.R[0], found.t[0], float(found.log_evidence[0]))
-    top, doubt = _relabelled(task, first)
-    return _decided(task, frame, found, top, doubt, _mirror_evidence(task, top, all_mirrors=all_mirrors))
+    top, doubt = _relabelled(tasks[0], first)
+    asked = tasks if not tasks[0].expects_roll else tasks[:1]  # the prior of a rolled mirror image excludes it
+    mirrors = [_mirror_evidence(one, top, all_mirrors=all_mirrors) for one in asked]
+    if None in mirrors:
+        return Acquisition((), (), 0.0, "too_many")
+    return _decided(tasks[0], frame, found, top, doubt, float(np.logaddexp.reduce(np.array(mirrors, float))))
+
+
+def _rivals_of_any_roll(task: _Search, found: Hypotheses) -> tuple[Hypotheses, bool]:
+    """Hypotheses of any roll that may stand against the best found so far; and whether the search came to its end.
+
+    Their prior is as small as a light is worth: with fewer lights than the best, or of one layer, they are out of the
+    question. Where the best may be an answer, its own detections tell first whether the array fits them turned, too.
+    """
+    config, best = task.config, float(found.log_evidence.max(initial=_NONE))
+    if best + config.log_dock <= config.margin:
+        least = CHECKED_LIGHTS + int(len(task.problem.uv) > _FEW)
+        return _search(task, task.problem, least, least, best=best)
+    count = task.model.count(found.assignments[0])
+    used = np.sort(found.assignments[0][found.assignments[0] >= 0])
+    least, of_a_layer = (max(n - _SPARE, CHECKED_LIGHTS) for n in (sum(count), max(count)))
+    turned, complete = _search(task, _only(task.problem, used), least, of_a_layer, best=best)
+    if not complete or (turned.log_evidence <= best - config.keep).all():
+        return _cut(turned, np.empty(0, np.int64)), complete
+    turned.assignments[:] = np.where(turned.assignments >= 0, used[turned.assignments], -1)
+    least, of_a_layer = (max(n, CHECKED_LIGHTS) for n in (sum(count), max(count)))
+    more, complete = _search(task, task.problem, least, of_a_layer, best=best)
+    return _merged(more, turned), complete
+
+
+def _only(problem: Problem, used: Indices) -> Problem:
+    """The same problem with some of its detections (K,) alone; the others stay clutter."""
+    uv = problem.uv[used]
+    by_u: Indices = np.argsort(uv[:, 0])
+    return problem._replace(uv=uv, by_u=by_u, ray=problem.ray[used], var=problem.var[used], like=problem.like[used])
+
+
+def _counted(assignment: Indices, model: StationModel) -> tuple[int, int]:
+    """How many lights have a detection, and how many of the layer that has most."""
+    count = model.count(assignment)
+    return sum(count), max(count)
+
+
+def _merged(a: Hypotheses, b: Hypotheses) -> Hypotheses:
+    """Two lists of hypotheses as one, the best first, without those of the second that are in the first."""
+    b = _cut(b, np.flatnonzero(~(b.assignments[:, None] == a.assignments[None]).all(axis=2).any(axis=1)))
+    together = Hypotheses(
+        np.concatenate([a.assignments, b.assignments]),
+        np.concatenate([a.log_evidence, b.log_evidence]),
+        np.concatenate([a.R, b.R]),
+        np.concatenate([a.t, b.t]),
+    )
+    best_first: Indices = np.argsort(-together.log_evidence, kind="stable")
+    return _cut(together, best_first)
+
+
+def _cut(found: Hypotheses, which: Indices) -> Hypotheses:
+    """Some hypotheses (K,) of a list."""
+    assignments, scores, R, t = found
+    return Hypotheses(assignments[which], scores[which], R[which], t[which])
+
+
+def _rolled(problem: Problem, prior: AttitudePrior) -> Problem:
+    """The same problem for a vehicle of any roll beyond that of the prior, its probability included."""
+    beyond = (problem.rules.roll_cosines[1], -_ANY_COSINE)
+    rules = problem.rules._replace(roll_cosines=beyond, log_prior=math.log(prior.any_roll))
+    info = prior.rolled().info
+    return problem._replace(info=info, steady=np.array([*problem.steady[:2], info[2]]), rules=rules)
 
 
 def _decided(
@@ -176,12 +256,17 @@ def _part(frame: Measurements, which: Indices) -> Measurements:
 
 
 def _likeliest(frame: Measurements, most: int) -> Indices | None:
-    """The detections (K,) that look most like lamps, `most` and those on a par; None where that leaves none out."""
-    least = LEAST_P_LIGHT
-    if len(frame.uv) > most:
-        least = max(least, float(np.partition(frame.p_light, -most)[-most]))
-    likely = np.flatnonzero(frame.p_light >= least)
-    return likely if len(likely) < len(frame.uv) else None
+    """The detections (K,) that look most like lamps, `most` and those on a par; None where that leaves none out.
+
+    Where too many are on a par, they stay only if they are rather lamps than not.
+    """
+    p_light, likely = frame.p_light, frame.p_light >= LEAST_P_LIGHT
+    if len(p_light) > most:
+        least = float(np.partition(p_light, -most)[-most])
+        likely &= p_light >= least
+        if likely.sum() > most and least < P_LAMP:
+            likely &= p_light > least
+    return None if likely.all() else np.flatnonzero(likely)
 
 
 def _renumbered(found: Acquisition, detections: Indices) -> Acquisition:
@@ -203,9 +288,8 @@ def _problem(
     offset = (frame.uv - lens[3:5]) * (0.5 * model.sigma_focal)
     var = frame.var + (offset**2).sum(axis=1)
     by_u: Indices = np.argsort(frame.uv[:, 0])
-    roll_rad = float(prior.info[2] ** -0.5)
     steady = prior.info * config.steadier**2
-    if roll_rad > _OPEN_ROLL_RAD:
+    if prior.roll_rad > _OPEN_ROLL_RAD:
         steady[2] = prior.info[2]
     return Problem(
         lens=lens,
@@ -225,11 +309,13 @@ def _problem(
         info=prior.info,
         steady=steady,
         rules=_rules(model, prior, config),
+        work=np.zeros(1, np.int64),
     )
 
 
 def _rules(model: StationModel, prior: AttitudePrior, config: MatchConfig) -> SearchRules:
-    tilt_var, roll_rad = float(1.0 / prior.info[:2].min()), float(prior.info[2] ** -0.5)
+    tilt_var, roll_rad = float(1.0 / prior.info[:2].min()), prior.roll_rad
+    gated = config.roll_gate * roll_rad < math.pi
     return SearchRules(
         log_volume=model.log_volume,
         detect=config.detect,
@@ -238,9 +324,10 @@ def _rules(model: StationModel, prior: AttitudePrior, config: MatchConfig) -> Se
         pair_gate=config.pair_gate,
         near_m=config.near_m,
         far_m=config.far_m,
-        roll_gate=min(config.roll_gate * roll_rad, math.pi),
+        roll_cosines=(_ANY_COSINE, math.cos(config.roll_gate * roll_rad) if gated else -_ANY_COSINE),
         bend=(config.bend * tilt_var) ** 2,
         steady=0.0 if prior.measured else config.steady,
+        log_prior=math.log1p(-prior.any_roll),
     )
 
 
@@ -257,23 +344,21 @@ def _search(task: _Search, problem: Problem, floor: int, *leasts: int, best: flo
     """Hypotheses of at least `floor` lights, best first, by searches that want ever fewer of one layer.
 
     A later search runs only where the one before left doubt and the detections are few. `best` is a log evidence to
-    measure up to. The second value says whether the search came to its end within its budget.
+    measure up to. The second value says whether the search came to its end, within the work that a frame may take.
     """
     k, m, count = task.config.hypotheses, len(problem.p), 0
     found = Hypotheses(np.empty((k, m), np.int64), np.empty(k), np.empty((k, 3, 3)), np.empty((k, 3)))
-    order, budget = task.model.order, np.array([task.config.max_pairs])
+    order, most_work = task.model.order, task.config.max_work
     for least in leasts:
-        bounds = np.array([least, floor, floor, floor - 1 if floor > least else 0])
+        bounds = np.array([least, floor, floor, 0, 0])
         reached = max(best, found.log_evidence[:count].max(initial=_NONE))
-        goal = Goal(bounds, budget, np.array([reached]))
+        goal = Goal(bounds, most_work, np.array([reached]))
         count = search(problem, order.pairs, order.unseen, goal, count, found)
-        sure = count > 0 and found.log_evidence[:count].max() > task.config.sure
+        sure = max(best, found.log_evidence[:count].max(initial=_NONE)) > task.config.sure
         if sure or len(task.problem.uv) > task.config.max_detections_three:
             break
     best_first = np.argsort(-found.log_evidence[:count], kind="stable")
-    assignments, scores, R, t = found
-    listed = Hypotheses(assignments[best_first], scores[best_first], R[best_first], t[best_first])
-    return listed, bool(budget[0] >= 0)
+    return _cut(found, best_first), int(problem.work[0]) <= most_work
 
 
 def _relabelled(task: _Search, top: Hypothesis) -> tuple[Hypothesis, Doubt]:
@@ -339,16 +424,18 @@ def _crowding(assignment: Indices, frame: Measurements, task: _Search) -> tuple[
     return unassigned, max(0.0, math.log(local * lens[6] * lens[7] / task.config.spurious))
 
 
-def _mirror_evidence(task: _Search, top: Hypothesis, *, all_mirrors: bool) -> float:
+def _mirror_evidence(task: _Search, top: Hypothesis, *, all_mirrors: bool) -> float | None:
     """Log evidence, prior included, that a mirror shows the array.
 
-    The water's surface does only where the image stands above the camera; a floor or a wall may do so anywhere.
+    The water's surface does only where the image stands above the camera; a floor or a wall may do so anywhere. None
+    where the search does not come to its end.
     """
-    n, total = top.n_assigned, _NONE
+    total, (n, of_a_layer) = _NONE, _counted(top.assignment, task.model)
+    least = min(n, CHECKED_LIGHTS) if task.expects_roll else max(of_a_layer, CHECKED_LIGHTS)
     for mirror in (_LEVEL, _UPRIGHT) if all_mirrors else (_LEVEL,):
-        found, complete = _search(task, task.mirrored(mirror), n, min(n, CHECKED_LIGHTS), best=top.log_evidence)
+        found, complete = _search(task, task.mirrored(mirror), n, least, best=top.log_evidence)
         if not complete:
-            return top.log_evidence
+            return None
         camera_y = -np.einsum("ki,ki->k", found.R[:, :, 1], found.t)
         possible = (camera_y < 0.0) | all_mirrors
         total = float(np.logaddexp.reduce([total, *found.log_evidence[possible]]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +16,9 @@ from lumidock.datatypes import Array, Attitude, Detections, Indices
 from lumidock.light_counts import MAX_SUBSETS
 from lumidock.station import Station
 
+_OPEN_ROLL_RAD = math.pi  # 1 sigma of a roll of which nothing is known
 _HEAD_ON = np.diag([1.0, -1.0, -1.0])  # R_dock_cam of a camera that looks straight into the dock
-_P_LAMP, _P_USUAL = 0.5, 0.15  # p_light above which a detection counts as a lamp; under which its centroid is doubtful
+P_LAMP, _P_USUAL = 0.5, 0.15  # p_light above which a detection counts as a lamp; under which its centroid is doubtful
 LEAST_P_LIGHT = 0.01  # a detection that is less likely a lamp leaves every answer as if it were not there
 _IMPOSSIBLE = -1e9  # log likelihood ratio
 _MOST_RADIUS_PX = 3.0  # px; of a detection without a radius, and the most that makes a doubtful centroid worse
@@ -73,11 +74,32 @@ class AttitudePrior:
     """The attitude expected: `R_dock_cam` (3, 3); `measured`: by a sensor.
 
     `info` (3,) 1/rad^2: one over the variance of the tilt toward cam x, of the tilt toward cam y, and of the roll.
+    `any_roll`: probability that the roll is any instead, 0 where a sensor has it.
     """
 
     R_dock_cam: Array
     info: Array
     measured: bool
+    any_roll: float = 0.0
+
+    @property
+    def roll_rad(self) -> float:
+        """1-sigma roll."""
+        return float(self.info[2] ** -0.5)
+
+    def rolled(self) -> AttitudePrior:
+        """The same tilt with a roll that is open."""
+        return replace(self, info=np.array([*self.info[:2], _OPEN_ROLL_RAD**-2]), any_roll=0.0)
+
+    def about(self, R_cam_dock: Array, gate: float) -> AttitudePrior:
+        """The prior of an attitude (3, 3): this one, or about its own roll where that is over `gate` sigmas off."""
+        D = self.R_dock_cam.T @ R_cam_dock.T
+        roll = math.atan2(D[1, 0] - D[0, 1], D[0, 0] + D[1, 1])
+        if self.any_roll == 0.0 or abs(roll) <= gate * self.roll_rad:
+            return self
+        c, s = math.cos(roll), math.sin(roll)
+        turned = self.R_dock_cam @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return replace(self.rolled(), R_dock_cam=turned)
 
 
 def station_model(station: Station, camera: Camera, config: MatchConfig) -> StationModel:
@@ -90,13 +112,20 @@ def station_model(station: Station, camera: Camera, config: MatchConfig) -> Stat
         layer=station.layer,
         n_layers=len(station.layers),
         is_rear=((behind == len(front_first) - 1) & (behind > 0)).astype(np.int64),  # a lone layer is the front one
-        group=np.arange(len(station)) % MAX_SUBSETS,
+        group=_groups(station),
         survey_m2=station.sigma_light_m**2 + (behind > 0)[station.layer] * 2.0 * station.sigma_layer_m**2,
         order=_pair_order(station),
         planes=_planes(station),
         log_volume=math.log(float(size.prod()) * config.far_m**3 / 3.0),
         sigma_focal=station.sigma_focal,
     )
+
+
+def _groups(station: Station) -> Indices:
+    """The subset (M,) that is blind to each light: layer by layer, so that two lights of one seldom share it."""
+    group = np.empty(len(station), np.int64)
+    group[np.argsort(station.layer, kind="stable")] = np.arange(len(station)) % MAX_SUBSETS
+    return group
 
 
 def _planes(station: Station) -> Array:
@@ -148,7 +177,7 @@ def attitude_prior(attitude: Attitude | None, config: PriorConfig) -> AttitudePr
     if attitude is not None:
         return AttitudePrior(np.ascontiguousarray(attitude.R_dock_cam), np.full(3, attitude.sigma_rad**-2), True)
     sigma = np.deg2rad([config.yaw_deg, config.pitch_deg, config.roll_deg])
-    return AttitudePrior(_HEAD_ON, sigma**-2, False)
+    return AttitudePrior(_HEAD_ON, sigma**-2, False, config.any_roll)
 
 
 def measurements(detections: Detections, model: StationModel, config: MatchConfig) -> Measurements:
@@ -181,12 +210,12 @@ def measurements(detections: Detections, model: StationModel, config: MatchConfi
 
 def weights(p_light: Array) -> Array:
     """How much each detection (N,) counts as clutter: one that is rather a lamp than not counts fully."""
-    return np.where(p_light < LEAST_P_LIGHT, 0.0, np.minimum(p_light / _P_LAMP, 1.0))
+    return np.where(p_light < LEAST_P_LIGHT, 0.0, np.minimum(p_light / P_LAMP, 1.0))
 
 
 def count_lamps(frame: Measurements) -> int:
     """How many detections are rather lamps than not."""
-    return int(np.count_nonzero(frame.p_light >= _P_LAMP))
+    return int(np.count_nonzero(frame.p_light >= P_LAMP))
 
 
 def possible_lamps(detections: Detections) -> int:

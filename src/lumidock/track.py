@@ -163,6 +163,12 @@ def open_bank(model: StationModel, states: int = 0, sensors: int = 0) -> Bank:
     )
 
 
+def empty_like(bank: Bank) -> Bank:
+    """Room for the states of the same bank, and its flags."""
+    offset, P, *flags = bank
+    return Bank(np.empty_like(offset), np.empty_like(P), *(values.copy() for values in flags))
+
+
 def _open_bank_of(state: FilterState, model: StationModel) -> Bank:
     """An open bank of as many states as the filter has; error states of sensors are those beyond the station's."""
     n = len(state.x)
@@ -171,10 +177,11 @@ def _open_bank_of(state: FilterState, model: StationModel) -> Bank:
 
 def _copied(bank: Bank) -> Bank:
     """The same bank in arrays of its own; what has not begun takes no time."""
-    offset, P, *flags = bank
-    copied_P, begun = np.empty_like(P), np.flatnonzero(bank.begun)
-    copied_P[begun] = P[begun]
-    return Bank(offset.copy(), copied_P, *(values.copy() for values in flags))
+    copied, begun = empty_like(bank), bank.begun == 1
+    copied.offset[begun] = bank.offset[begun]
+    for s in np.flatnonzero(begun):
+        copied.P[s] = bank.P[s]
+    return copied
 
 
 def open_states(calibration: CalibrationStates, config: TrackConfig) -> tuple[Array, Array]:
@@ -359,7 +366,7 @@ def _bank_updated(
     before: Track, after: Track, frame: Measurements, model: StationModel, config: TrackConfig, *, starting: bool
 ) -> Track:
     """The updated track with its bank updated too, which is still that of the track `before`."""
-    bank, seen = _copied(before.bank), Assigned(after.last.assignment, frame.uv, frame.cov)
+    seen, bank = Assigned(after.last.assignment, frame.uv, frame.cov), empty_like(before.bank)
     rules = BankRules(
         group=model.group,
         layer=model.layer,
@@ -370,9 +377,7 @@ def _bank_updated(
         turn_cov=after.state.P[3:6, 3:6].copy(),
         proven_m=config.proven_m,
     )
-    bank_kernel.begin_subsets(bank, before.state, after.last.assignment, model.group)
-    bank_kernel.shift_bank(bank, before.state, after.state)
-    bank_kernel.update_bank(model.lights, after.state, seen, rules, bank)
+    bank_kernel.update_bank(model.lights, before.state, after.state, seen, rules, bank=before.bank, updated=bank)
     return replace(after, bank=bank)
 
 

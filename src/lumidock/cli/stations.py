@@ -66,9 +66,24 @@ def _print(result: dict[str, Any]) -> None:
     for row in result["confusions"]:
         cells = [_misfit(row[f"{kind}_m"], row[f"{kind}_px"]) for kind in ("assignment", "mirror")]
         print(f"{row['layer']:10} {row['seen']:4}   {cells[0]:30}  {cells[1]}")
+    _print_self_fits(result)
     print()
     for text in result["failed"] or ["all checks passed"]:
         print(text if not result["failed"] else f"FAILED: {text}")
+
+
+def _print_self_fits(result: dict[str, Any]) -> None:
+    """What turns, moves or mirrors the array nearly onto itself, and from which roll on that is not safe."""
+    print("\nthe array nearly fits itself when it is")
+    for row in result["self_fits"]:
+        turned = f"turned by {row['angle_deg']:.1f} degrees"
+        what = {"rotation": turned, "mirror": f"mirrored and {turned}", "shift": f"moved by {row['shift_m']:.2f} m"}
+        misfit = f"{row['misfit_m']:.3f} m, {row['misfit_px']:.2f} px at 18 m"
+        print(f"  {what[row['kind']]:40} {row['lights']:3} lights within {misfit}")
+    if not result["self_fits"]:
+        print("  nowhere else")
+    if result["unsafe_roll_deg"] is not None:
+        print(f"unsafe beyond {result['unsafe_roll_deg']:.1f} degrees of roll without an attitude sensor")
 
 
 def _corridor_line(row: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from lumidock import track
 from lumidock._kernels.tracking import track as kernel
-from lumidock._kernels.tracking.bank import BankRules, begin_subsets, predict_bank, update_bank
+from lumidock._kernels.tracking.bank import BankRules, predict_bank, update_bank
 from lumidock._kernels.tracking.levels import Groups, protection_levels
 from lumidock._kernels.tracking.track import FilterState
 from lumidock._kernels.tracking.update import Assigned, UpdateRules, update
@@ -129,7 +129,7 @@ class Bound:
             turn_cov=np.eye(3),
         )
         seen = Assigned(assignment, uv, cov)
-        begin_subsets(self._bank, state, assignment, self._model.group)
+        before, bank = state._replace(P=state.P.copy()), track.empty_like(self._bank)
         update(self._model.lights, self._at(R, t), state, seen, rules)
         bank_rules = BankRules(
             group=self._model.group,
@@ -141,4 +141,5 @@ class Bound:
             turn_cov=np.eye(3),
             proven_m=self.config.track.proven_m,
         )
-        update_bank(self._model.lights, self._at(R, t), seen, bank_rules, self._bank)
+        update_bank(self._model.lights, before, before, seen, bank_rules, bank=self._bank, updated=bank)
+        self._bank = bank

@@ -13,6 +13,7 @@ from lumidock.config import Config
 from lumidock.datatypes import Array, Indices
 from lumidock.evaluation.confusion import Confusion, worst_confusion
 from lumidock.evaluation.cramer_rao import Bound
+from lumidock.evaluation.symmetry import SelfFit, self_fits, unsafe_roll_rad
 from lumidock.pose import project_lights
 from lumidock.station import Station
 
@@ -21,6 +22,8 @@ _START_Z_M, _SPEED_M_S, _RATE_HZ = 30.0, 1.0, 10.0
 _ROWS_Z_M = (30, 24, 20, 18, 15, 12, 10, 8, 6, 5, 4, 3, 2, 1.5, 1, 0.5, 0, -0.5, -1, -2, -3)
 _MAX_ASSIGNMENTS = 2_000_000  # that are tried for one row of confusions
 _LEAST_IDENTIFIED = 4  # lights of a layer that identify each other in one frame
+_NEARLY = 5.0  # times the misfit that is required, within which the array nearly fits itself
+_MOST_FITS = 4  # of a kind that are listed
 _STAGE_LIGHTS = 3  # of a layer in view, from which a pose can rest on it
 
 
@@ -50,6 +53,9 @@ def inspect_station(station: Station, camera: Camera, config: Config, required: 
     """Visibility, confusions and expected accuracy of a dock, and in `failed` the requirements it does not meet."""
     corridor = _corridor(station, camera, config)
     confusions = [row for layer in station.layers_front_to_rear() for row in _confusions(station, camera, layer)]
+    metre_px = float(camera.focal_px.mean()) / CONFUSION_AT_M
+    fits = self_fits(station, _NEARLY * required.confusion_px / metre_px)
+    unsafe = unsafe_roll_rad(fits, required.confusion_px / metre_px)
     return {
         "name": station.name,
         "layers": {layer: len(station.lights_of(layer)) for layer in station.layers_front_to_rear()},
@@ -57,8 +63,26 @@ def inspect_station(station: Station, camera: Camera, config: Config, required: 
         "alert_limits": station.alert_limits.as_text(),
         "corridor": corridor,
         "confusions": confusions,
+        "self_fits": _listed(fits, metre_px),
+        "unsafe_roll_deg": None if unsafe is None else math.degrees(unsafe),
         "failed": [*_weak_layouts(confusions, required), *_too_few_in_view(station, camera, corridor, required)],
     }
+
+
+def _listed(fits: list[SelfFit], metre_px: float) -> list[dict[str, Any]]:
+    """The best rotations, shifts and mirror images under which the array nearly fits itself, as rows."""
+    some = [one for kind in ("rotation", "shift", "mirror") for one in [f for f in fits if f.kind == kind][:_MOST_FITS]]
+    return [
+        {
+            "kind": one.kind,
+            "angle_deg": math.degrees(one.angle_rad),
+            "shift_m": one.shift_m,
+            "lights": one.lights,
+            "misfit_m": one.residual_m,
+            "misfit_px": one.residual_m * metre_px,
+        }
+        for one in some
+    ]
 
 
 def in_view(station: Station, camera: Camera, T_dock_cam: Array) -> InView:

@@ -80,7 +80,8 @@ class Path3D(KnobSection):
     def _path_has_frames(self) -> Self:
         if self.speed_spread_m_s >= self.speed_m_s:
             raise ValueError("speed_spread_m_s: has to be less than speed_m_s")
-        others = _OF_DRAWS & self.model_fields_set
+        fields = type(self).model_fields  # a scenario that was written out names its defaults too
+        others = {name for name in _OF_DRAWS & self.model_fields_set if getattr(self, name) != fields[name].default}
         if others and self.kind != "draws":
             raise ValueError(f"{min(others)}: only a path of kind draws has it, and this is of kind {self.kind}")
         if self.kind == "draws":

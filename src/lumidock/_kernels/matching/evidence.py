@@ -32,6 +32,8 @@ LOG_2PI = math.log(2.0 * math.pi)
 HUGE = 1e300  # as a log evidence, negative: impossible
 _ELSEWHERE = 8.0  # log odds of two priors that one solution under both cannot reach
 STEPS = 6  # of Gauss-Newton, at most; from a pose that is nearly right two or three are enough
+FIT_WORK = 4  # units of work that a fit counts for; one is a pose of two pixels, checked against a layer's lights
+SCAN_WORK = 48  # detections that are looked through for a unit of work
 
 
 class SearchRules(NamedTuple):
@@ -40,8 +42,9 @@ class SearchRules(NamedTuple):
     `log_volume`: log of the volume m^3 of the view cone up to `far_m`. `detect`: probability that a light in view is
     detected; `absent`: that a whole layer is not seen. `gate`, `pair_gate`: chi-square (2 dof) of a detection for a
     light that is placed by three lights or more, by two and the attitude prior. `near_m`, `far_m`: distances of a
-    light. `roll_gate`: largest roll rad off the prior. `bend`: variance per px^2 of separation that the unknown tilt
-    adds. `steady`: share of vehicles that hold the expected attitude well.
+    light. `roll_cosines`: of the least and of the largest roll off the prior. `bend`: variance per px^2 of separation
+    that the unknown tilt adds. `steady`: share of vehicles that hold the expected attitude well. `log_prior`: log
+    probability of such rolls.
     """
 
     log_volume: float
@@ -51,9 +54,10 @@ class SearchRules(NamedTuple):
     pair_gate: float
     near_m: float
     far_m: float
-    roll_gate: float
+    roll_cosines: tuple[float, float]
     bend: float
     steady: float
+    log_prior: float
 
 
 class Problem(NamedTuple):
@@ -65,7 +69,7 @@ class Problem(NamedTuple):
     (N,) px^2 and the largest of them, log likelihood ratio of each for each layer `like` (N, L), and `log_clutter`
     (N + 1,), the log probability of so many as clutter. The attitude prior: `Rp` (3, 3) = R_dock_cam, `info` (3,)
     1/rad^2 of tilt toward cam x, toward cam y and of roll; `steady` (3,) the same of a vehicle that holds its attitude
-    well.
+    well. `work` (1,): units of work done so far, counted in place; `FIT_WORK` says what a unit is.
     """
 
     lens: Array
@@ -85,6 +89,7 @@ class Problem(NamedTuple):
     info: Array
     steady: Array
     rules: SearchRules
+    work: Indices
 
 
 class Candidate(NamedTuple):
@@ -128,6 +133,7 @@ def survey_var(lens: Array, R: Array, t: Array, p: Array, survey_m2: float) -> f
 def fit(one: Candidate, problem: Problem, info: Array, steps: int, H: Array, L: Array) -> tuple[float, float, float]:
     """Most probable pose of the assigned lights, in place: cost, log det H, and the sum of log(2 pi variance)."""
     assignment, R, t = one
+    problem.work[0] += FIT_WORK
     used, log_var = assigned_lights(assignment), 0.0
     ps, uvs, vs = np.empty((len(used), 3)), np.empty((len(used), 2)), np.empty(len(used))
     for k in range(len(used)):
@@ -152,7 +158,7 @@ def log_evidence(one: Candidate, problem: Problem, info: Array, fitted: tuple[fl
     distance = max(math.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2]), rules.near_m)
     # position prior: half flat inside the view cone, half flat in the logarithm of the distance
     near = (rules.far_m / distance) ** 3 / (3.0 * math.log(rules.far_m / rules.near_m))
-    total += math.log(0.5 + 0.5 * near) - rules.log_volume
+    total += math.log(0.5 + 0.5 * near) - rules.log_volume + rules.log_prior
     for k in range(3):
         total += 0.5 * math.log(info[k])
     layers = problem.like.shape[1]

@@ -9,7 +9,7 @@ import numpy as np
 
 from lumidock._kernels.compiling import part
 from lumidock._kernels.lens import copy_to
-from lumidock._kernels.matching.evidence import HUGE, Candidate, Problem, innovation, survey_var
+from lumidock._kernels.matching.evidence import HUGE, SCAN_WORK, Candidate, Problem, innovation, survey_var
 from lumidock._kernels.pose import light_row
 from lumidock.datatypes import Array, Indices
 
@@ -60,29 +60,41 @@ def cheapest(
     Fills rows of `out` (K, 3) with NIS + log det S - 2 log likelihood, light and detection; returns how many, and how
     many lights have a detection not far outside their gate.
     """
-    rank, layer, uv, var, like = problem.rank, problem.layer, problem.uv, problem.var, problem.like
+    rank, layer, uv, var, like, by_u = (
+        problem.rank,
+        problem.layer,
+        problem.uv,
+        problem.var,
+        problem.like,
+        problem.by_u,
+    )
     found, near = 0, 0
+    problem.work[0] += 1 + len(problem.uv) // SCAN_WORK
     for c in range(len(layer)):
         if not expected.sought[c] or rank[c] <= after:
             continue
         u, v, S, least = expected.rows[c, 0], expected.rows[c, 1], expected.S[c], HUGE
-        for i in range(len(uv)):
+        reach = math.sqrt(_NEAR * gate * (S[0] + problem.loosest))
+        for k in range(_first(uv, by_u, u - reach), len(by_u)):
+            i = by_u[k]
+            if uv[i, 0] - u > reach:
+                break
             if taken[i] >= 0:
                 continue
-            square, log_det = nis(uv[i, 0] - u, uv[i, 1] - v, S, var[i])
+            square, det = nis(uv[i, 0] - u, uv[i, 1] - v, S, var[i])
             least = min(least, square)
             if square <= gate:
-                found = _insert(out, found, square + log_det - 2.0 * like[i, layer[c]], c, i)
+                found = _insert(out, found, square + math.log(det) - 2.0 * like[i, layer[c]], c, i)
         near += least <= _NEAR * gate
     return found, near
 
 
 @part
 def nis(du: float, dv: float, S: Array, var: float) -> tuple[float, float]:
-    """Normalised innovation squared of a detection (du, dv) px off, and the log determinant of its covariance."""
+    """Normalised innovation squared of a detection (du, dv) px off, and the determinant px^4 of its covariance."""
     s0, s1, s2 = S[0] + var, S[1], S[2] + var
     det = s0 * s2 - s1 * s1
-    return (s2 * du * du - 2.0 * s1 * du * dv + s0 * dv * dv) / det, math.log(det)
+    return (s2 * du * du - 2.0 * s1 * du * dv + s0 * dv * dv) / det, det
 
 
 @part
@@ -110,6 +122,7 @@ def support(
     """
     rows, layer, uv, by_u = expected.rows, problem.layer, problem.uv, problem.by_u
     row, S, P2, shift, found = rows[c], np.empty(3), np.empty((6, 6)), np.empty(6), 0
+    problem.work[0] += 1 + len(problem.uv) // SCAN_WORK
     S[0], S[1], S[2] = expected.S[c, 0] + problem.var[i], expected.S[c, 1], expected.S[c, 2] + problem.var[i]
     _condition(row, expected.P, S, uv[i, 0] - row[0], uv[i, 1] - row[1], P2, shift)
     taken[i] = c

@@ -9,10 +9,14 @@ import numpy as np
 
 from lumidock._kernels.compiling import part
 from lumidock._kernels.lens import invert6
-from lumidock._kernels.matching.evidence import Problem, SearchRules, innovation, survey_var
+from lumidock._kernels.matching.evidence import SCAN_WORK, Problem, SearchRules, innovation, survey_var
 from lumidock._kernels.matching.gates import Expected, occupied
 from lumidock._kernels.pose import light_row
 from lumidock.datatypes import Array, Indices
+
+SUPPORT, MERIT, LIGHTS, FIRST, SECOND, DEPTH, ROLL = range(7)  # columns of a list of tries
+MERITS = 8  # classes of tries with as many lights in place, by prior and looks
+_MERIT_STEP = 2.0  # of twice the log probability, from one class to the next; the last holds all of the prior's tail
 
 
 class Pair(NamedTuple):
@@ -65,37 +69,57 @@ def _open_attitude(problem: Problem, open_: Array) -> None:
 
 @part
 def pair_poses(
-    a: int, b: int, least: int, problem: Problem, pose: PairPose, expected: Expected, budget: Indices, tries: Array
-) -> int:
-    """All pairs of detections that lights `a` and `b` may have made.
+    lights: tuple[int, int], least: int, most_work: int, problem: Problem, pose: PairPose, expected: Expected
+) -> Array:
+    """All pairs of detections that two `lights` of a layer may have made, rows (K, 7).
 
-    Fills rows of `tries`: how many other lights of the layer are in place, the two detections, depth of `a`, and roll.
-    Pairs with fewer than `least` in place are left out, and all that exceed the `budget` (1,). Returns how many rows.
+    A row has how many other lights of the layer are in place (`SUPPORT`), the `MERIT` of the pair among those with as
+    many, the two lights as a * M + b, the two detections, the depth of the first light m and the roll rad. Pairs with
+    fewer than `least` in place are left out, and all beyond `most_work`.
     """
-    n, found, taken = len(problem.uv), 0, pose.taken
-    d, sols = np.empty(3), np.empty((2, 2))
+    (a, b), n, taken, m = lights, len(problem.uv), pose.taken, len(problem.p)
+    d, sols, rows, found = np.empty(3), np.empty((2, 2)), np.empty((64, 7)), 0
     for k in range(3):  # R_cam_dock of the prior is Rp^T
         d[k] = 0.0
         for o in range(3):
             d[k] += problem.Rp[o, k] * (problem.p[b, o] - problem.p[a, o])
     for i in range(n):
+        problem.work[0] += n // SCAN_WORK
         for j in range(n):
             if i == j or not (problem.ray[i, 2] > 0.0 and problem.ray[j, 2] > 0.0):
                 continue
             for sol in range(_pair_pose(d, problem.ray[i], problem.ray[j], problem.rules, sols)):
-                budget[0] -= 1
-                if budget[0] < 0:
-                    return found
+                if problem.work[0] > most_work:
+                    return rows[:found]
                 pair = Pair(a, b, i, j, sols[sol, 0], sols[sol, 1])
                 know_pair(pair, problem, pose, expected.rows[a], expected.P)
                 taken[i], taken[j] = a, b
                 support = in_place(pair, least, problem, pose, expected)
                 taken[i], taken[j] = -1, -1
                 if support >= least:
-                    tries[found, 0], tries[found, 1], tries[found, 2] = support, i, j
-                    tries[found, 3], tries[found, 4] = pair.z, pair.roll
+                    if found == len(rows):
+                        rows = np.concatenate((rows, np.empty(rows.shape)))
+                    rows[found, SUPPORT], rows[found, MERIT] = support, _merit(pair, problem)
+                    rows[found, LIGHTS], rows[found, FIRST], rows[found, SECOND] = a * m + b, i, j
+                    rows[found, DEPTH], rows[found, ROLL] = pair.z, pair.roll
                     found += 1
-    return found
+    return rows[:found]
+
+
+@part
+def _merit(pair: Pair, problem: Problem) -> int:
+    """How well a pair fits the expected roll and looks like its layer, from 0 to `MERITS` - 1."""
+    layer = problem.layer[pair.a]
+    unlike = pair.roll * pair.roll * problem.info[2]
+    unlike -= 2.0 * (problem.like[pair.i, layer] + problem.like[pair.j, layer])
+    return MERITS - 1 - int(min(max(unlike / _MERIT_STEP, 0.0), MERITS - 1.0))
+
+
+@part
+def pair_of(row: Array, lights: int) -> Pair:
+    """The pair of a row (7,) of tries, of a station of so many `lights`."""
+    both = int(row[LIGHTS])
+    return Pair(both // lights, both % lights, int(row[FIRST]), int(row[SECOND]), row[DEPTH], row[ROLL])
 
 
 @part
@@ -106,10 +130,10 @@ def _pair_pose(d: Array, ray_i: Array, ray_j: Array, rules: SearchRules, out: Ar
     """
     xi, yi = ray_i[0] / ray_i[2], ray_i[1] / ray_i[2]
     xj, yj = ray_j[0] / ray_j[2], ray_j[1] / ray_j[2]
-    dx, dy = xj - xi, yj - yi
+    dx, dy, across = xj - xi, yj - yi, d[0] * d[0] + d[1] * d[1]
     A = dx * dx + dy * dy
     B = d[2] * (dx * xj + dy * yj)
-    C = d[2] * d[2] * (xj * xj + yj * yj) - (d[0] * d[0] + d[1] * d[1])
+    C = d[2] * d[2] * (xj * xj + yj * yj) - across
     root = B * B - A * C
     if A <= 0.0 or root < 0.0:
         return 0
@@ -120,10 +144,10 @@ def _pair_pose(d: Array, ray_i: Array, ray_j: Array, rules: SearchRules, out: Ar
         if not rules.near_m < z < rules.far_m or z + d[2] < rules.near_m:
             continue
         ex, ey = z * dx + d[2] * xj, z * dy + d[2] * yj
-        roll = math.atan2(d[0] * ey - d[1] * ex, d[0] * ex + d[1] * ey)
-        if abs(roll) > rules.roll_gate:
+        along, (least, largest) = d[0] * ex + d[1] * ey, rules.roll_cosines
+        if along > least * across or along < largest * across:  # of both vectors `across` is the squared length
             continue
-        out[found, 0], out[found, 1] = z, roll
+        out[found, 0], out[found, 1] = z, math.atan2(d[0] * ey - d[1] * ex, along)
         found += 1
     return found
 
@@ -133,6 +157,7 @@ def know_pair(pair: Pair, problem: Problem, pose: PairPose, h: Array, P: Array) 
     """Fill `pose` and its covariance `P` (6, 6) from two lights and the expected attitude; `h` (14,) is work space."""
     a, b, i, j, z, roll = pair
     R, t = pose.R, pose.t
+    problem.work[0] += 1
     _pose_of(problem.Rp, roll, z, problem.ray[i], problem.p[a], R, t)
     H = pose.H
     for m in range(3):

@@ -27,15 +27,27 @@ from lumidock._kernels.matching.evidence import (
 )
 from lumidock._kernels.matching.gates import ANY, Expected, cheapest, expect, new_expected, support
 from lumidock._kernels.matching.grow import NONE, extend, grow
-from lumidock._kernels.matching.pairs import Pair, PairPose, in_place, know_pair, new_pair_pose, pair_poses
+from lumidock._kernels.matching.pairs import (
+    MERIT,
+    MERITS,
+    SUPPORT,
+    Pair,
+    PairPose,
+    in_place,
+    know_pair,
+    new_pair_pose,
+    pair_of,
+    pair_poses,
+)
 from lumidock.datatypes import Array, Indices
 
 _THIRDS, _ALL_THIRDS = 3, 24  # third lights tried for a pair; and where three are all there may be
 _FOURTHS = 4  # fourth lights tried for each
+_STEPS_THREE = 2  # of Gauss-Newton for three lights, whose tilt is open: they place a fourth, and then all are solved
 _CLOSE = 10.0  # log evidence; an association of one layer this far behind the best is still tried with the others
 
 
-LEAST, FLOOR, MOST, IN_LAYER = range(4)  # entries of `Goal.bounds`
+LEAST, FLOOR, MOST, IN_LAYER, LEVEL = range(5)  # entries of `Goal.bounds`
 
 
 class Hypotheses(NamedTuple):
@@ -54,13 +66,13 @@ class Hypotheses(NamedTuple):
 class Goal(NamedTuple):
     """What a search still looks for.
 
-    `bounds` (4,): the `LEAST` lights of one layer; the least in all (`FLOOR`); the `MOST` assigned so far, less one;
-    the most in one layer so far, less one (`IN_LAYER`). `budget` (1,): pairs that may still be tried. `best` (1,): log
-    evidence so far.
+    `bounds` (5,): the `LEAST` lights of one layer; the least in all (`FLOOR`); the `MOST` assigned so far, less one;
+    the most in one layer so far, less one (`IN_LAYER`); how many of one layer are wanted now (`LEVEL`). `most_work`:
+    units of the problem's work at which it gives up. `best` (1,): log evidence so far.
     """
 
     bounds: Indices
-    budget: Indices
+    most_work: int
     best: Array
 
 
@@ -69,26 +81,29 @@ def search(problem: Problem, pairs: Indices, unseen: Indices, goal: Goal, count:
     """Add the best hypotheses to the `count` of a list; returns how many there are then.
 
     `pairs` (S, 2) are lights of one layer, in order; `unseen` (S,) is the most lights of one layer that a hypothesis
-    can assign without any pair before that one. The search stops when what it has not seen cannot come within one
-    light of the best, in all or in any one layer, so that it is exhaustive in what matters; or when its budget is
-    spent, which then is negative. Of a pair of lights those detections come first that leave most others in place.
+    can assign without any pair before that one. Hypotheses are looked for level by level, those with most lights of a
+    layer first: by the pairs of lights that no such hypothesis does without, and by those detections for them that
+    leave enough others in place, most first. What is tried again on a lower level costs little: the more lights are
+    wanted, the sooner a try ends. The search stops when what it has not seen cannot come within one light of the best,
+    in all or in any one layer, so that it is exhaustive in what matters; or, unfinished, when its work is done.
     """
-    n, layers = problem.like.shape
-    pose, expected = new_pair_pose(problem), new_expected(len(problem.p))
-    tries = np.empty((2 * n * n, 5))
+    lights, layers, done = len(problem.p), problem.like.shape[1], 0
+    pose, expected = new_pair_pose(problem), new_expected(lights)
+    tries = np.empty((0, 7))
     thirds = np.empty((_THIRDS if goal.bounds[LEAST] > 3 else _ALL_THIRDS, 3))
-    for s in range(len(pairs)):
-        if unseen[s] < _wanted(goal, layers):
-            break
-        a, b = pairs[s]
-        found = pair_poses(a, b, max(_wanted(goal, layers) - 2, 1), problem, pose, expected, goal.budget, tries)
-        for o in _most_first(tries, found, len(problem.p)):
-            if tries[o, 0] < max(_wanted(goal, layers) - 2, 1):
+    level = unseen[0] if len(unseen) else 0
+    while level >= _matter(goal, layers) and problem.work[0] <= goal.most_work:
+        goal.bounds[LEVEL] = level
+        while done < len(pairs) and unseen[done] >= level and problem.work[0] <= goal.most_work:
+            least = max(_matter(goal, layers) - 2, 1)
+            both = (pairs[done, 0], pairs[done, 1])
+            tries = np.concatenate((tries, pair_poses(both, least, goal.most_work, problem, pose, expected)))
+            done += 1
+        for o in _most_first(tries, lights):
+            if tries[o, SUPPORT] < _wanted(goal, layers) - 2 or problem.work[0] > goal.most_work:
                 break
-            pair = Pair(a, b, int(tries[o, 1]), int(tries[o, 2]), tries[o, 3], tries[o, 4])
-            count = _try_pair(pair, problem, pose, expected, thirds, goal, count, hypotheses)
-        if goal.budget[0] < 0:
-            break
+            count = _try_pair(pair_of(tries[o], lights), problem, pose, expected, thirds, goal, count, hypotheses)
+        level -= 1
     for k in range(count):
         one = Candidate(hypotheses.assignments[k], hypotheses.R[k], hypotheses.t[k])
         hypotheses.log_evidence[k] = evidence(one, problem, STEPS, pose.H, pose.L)
@@ -96,25 +111,31 @@ def search(problem: Problem, pairs: Indices, unseen: Indices, goal: Goal, count:
 
 
 @part
-def _most_first(tries: Array, found: int, lights: int) -> Indices:
-    """The order (found,) of rows that have most other lights in place first, and of equal ones the earlier."""
-    order, start = np.empty(found, np.int64), np.zeros(lights + 2, np.int64)
-    for o in range(found):
-        start[int(tries[o, 0])] += 1
-    for k in range(lights, -1, -1):  # from counts to the place after all that have as many or more
+def _most_first(tries: Array, lights: int) -> Indices:
+    """The order (K,) of tries that have most other lights in place first, of these the likelier, then the earlier."""
+    order, start = np.empty(len(tries), np.int64), np.zeros(MERITS * (lights + 2) + 1, np.int64)
+    for row in tries:
+        start[int(row[SUPPORT]) * MERITS + int(row[MERIT])] += 1
+    for k in range(len(start) - 2, -1, -1):  # from counts to the place after all that come first or are as good
         start[k] += start[k + 1]
-    for o in range(found - 1, -1, -1):
-        k = int(tries[o, 0])
+    for o in range(len(tries) - 1, -1, -1):
+        k = int(tries[o, SUPPORT]) * MERITS + int(tries[o, MERIT])
         start[k] -= 1
         order[start[k]] = o
     return order
 
 
 @part
-def _wanted(goal: Goal, layers: int) -> int:
+def _matter(goal: Goal, layers: int) -> int:
     """How many lights of one layer a hypothesis must assign to matter."""
-    least, floor, most, in_layer = goal.bounds
-    return max(least, in_layer, (max(most, floor) + layers - 1) // layers)
+    bounds = goal.bounds
+    return max(bounds[LEAST], bounds[IN_LAYER], (max(bounds[MOST], bounds[FLOOR]) + layers - 1) // layers)
+
+
+@part
+def _wanted(goal: Goal, layers: int) -> int:
+    """How many lights of one layer are looked for now."""
+    return max(goal.bounds[LEVEL], _matter(goal, layers))
 
 
 @part
@@ -138,6 +159,8 @@ def _try_pair(
     found, _ = cheapest(max(rank[a], rank[b]), expected, taken, problem, gate, thirds)
     for k in range(found):
         c, o = int(thirds[k, 1]), int(thirds[k, 2])
+        if problem.work[0] > goal.most_work:
+            break
         if _known(pair, c, o, hypotheses.assignments, count):
             continue
         wanted = _wanted(goal, layers)
@@ -170,7 +193,7 @@ def _try_three(
     """Grow associations from three lights and list them: the cheapest fourth first, then those it led away from."""
     layers, fourths, expected = problem.like.shape[1], np.empty((_FOURTHS, 3)), new_expected(len(three.assignment))
     H, L, start = np.empty((6, 6)), np.empty((6, 6)), copied(three)
-    fit(start, problem, problem.info, STEPS, H, L)
+    fit(start, problem, problem.info, _STEPS_THREE, H, L)
     if math.isnan(invert6(H, L, expected.P)):
         return count
     expect(layer, start, problem, expected)

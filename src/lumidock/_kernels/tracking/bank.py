@@ -151,38 +151,43 @@ def shift_bank(bank: Bank, before: FilterState, after: FilterState) -> None:
 
 
 @entry
-def begin_subsets(bank: Bank, state: FilterState, assignment: Indices, group: Indices) -> None:
-    """Branch subsets off the filter's predicted `state` for the lights that are used for the first time."""
-    for c in range(len(assignment)):
-        if assignment[c] < 0:
-            continue
-        s, bank.used[c] = group[c], 1
-        if bank.begun[s] == 0:
-            bank.begun[s], bank.plane[s] = 1, -1
-            for i in range(len(state.x)):
-                bank.offset[s, i] = 0.0
-                copy_to(state.P[i], bank.P[s, i])
+def update_bank(
+    station: Lights,
+    before: FilterState,
+    after: FilterState,
+    seen: Assigned,
+    rules: BankRules,
+    bank: Bank,
+    updated: Bank,
+) -> None:
+    """Update every subset of a `bank` by the assigned detections that it may see, into `updated`, another bank.
 
-
-@entry
-def update_bank(station: Lights, state: FilterState, seen: Assigned, rules: BankRules, bank: Bank) -> None:
-    """Update every subset by the assigned detections that it may see, in place; `state` is the updated filter's.
-
-    Linearised at a wrong tilt, a single plane would seem to measure its tilt. So a subset that sees only one plane is
-    linearised at the most frontal view within three sigmas of its own tilt, as in `update`.
+    `before` and `after` are the filter's states before and after its own update. Subsets branch off `before` for the
+    lights that are used for the first time. Linearised at a wrong tilt, a single plane would seem to measure its tilt.
+    So a subset that sees only one plane is linearised at the most frontal view within three sigmas of its own tilt, as
+    in `update`.
     """
-    n, pixels = len(state.x), _rows(station, state, seen.assignment)
-    r = 2 * len(pixels.lights)
+    n, pixels = len(after.x), _rows(station, after, seen.assignment)
+    r, move, first = 2 * len(pixels.lights), np.zeros(n), np.empty(n)
     work = _Work(np.empty((r, r)), np.empty((r, n)), np.empty(r), np.empty(r))
+    difference(before.R, before.t, after.R, after.t, move)
+    for i in range(6, n):
+        move[i] = after.x[i] - before.x[i]
+    for c in range(len(seen.assignment)):
+        if seen.assignment[c] >= 0:
+            updated.used[c] = updated.begun[rules.group[c]] = 1
     for s in range(len(bank.begun)):
-        if bank.begun[s] == 0:
+        if updated.begun[s] == 0:
             continue
-        bank.plane[s] = _plane_of(s, pixels.lights, rules)
-        if bank.plane[s] < 0:
-            _update_one(s, seen, pixels, pixels, rules, work, bank)
+        P = bank.P[s] if bank.begun[s] == 1 else before.P
+        for i in range(n):
+            first[i] = (bank.offset[s, i] if bank.begun[s] == 1 else 0.0) - move[i]
+        updated.plane[s] = _plane_of(s, pixels.lights, rules)
+        if updated.plane[s] < 0:
+            _update_one(s, first, P, seen, pixels, pixels, rules, work, updated)
         else:
-            _update_flattened(s, station, state, seen, pixels, rules, work, bank)
-    _prove(station, state, seen, pixels, rules, bank)
+            _update_flattened(s, first, P, station, after, seen, pixels, rules, work, updated)
+    _prove(station, after, seen, pixels, rules, updated)
 
 
 @part
@@ -201,9 +206,23 @@ def _rows(station: Lights, state: FilterState, assignment: Indices) -> _Rows:
 
 
 @part
-def _update_one(s: int, seen: Assigned, pixels: _Rows, rows: _Rows, rules: BankRules, work: _Work, bank: Bank) -> None:
-    """Update one subset by all lights that it may see: innovations from `pixels`, Jacobians of `rows`."""
-    P, offset = bank.P[s], bank.offset[s]
+def _update_one(
+    s: int,
+    first: Array,
+    P: Array,
+    seen: Assigned,
+    pixels: _Rows,
+    rows: _Rows,
+    rules: BankRules,
+    work: _Work,
+    updated: Bank,
+) -> None:
+    """Update one subset of offset `first` and covariance `P` by all lights that it may see, into `updated`.
+
+    Innovations are those of `pixels`, Jacobians those of `rows`.
+    """
+    offset = updated.offset[s]
+    copy_to(first, offset)
     used, m = np.empty(len(rows.lights), np.int64), 0
     for k in range(len(rows.lights)):
         if rules.group[rows.lights[k]] != s:
@@ -215,8 +234,8 @@ def _update_one(s: int, seen: Assigned, pixels: _Rows, rows: _Rows, rules: BankR
         c, h, cal = rows.lights[k], rows.h[k], rows.cal[k]
         uv = seen.uv[seen.assignment[c]]
         gains(P, h, cal, c, G[2 * a], G[2 * a + 1])
-        nu[2 * a] = uv[0] - pixels.h[k, 0] - dot_row(offset, h, cal, 0, c)
-        nu[2 * a + 1] = uv[1] - pixels.h[k, 1] - dot_row(offset, h, cal, 1, c)
+        nu[2 * a] = uv[0] - pixels.h[k, 0] - dot_row(first, h, cal, 0, c)
+        nu[2 * a + 1] = uv[1] - pixels.h[k, 1] - dot_row(first, h, cal, 1, c)
     for a in range(m):
         k = used[a]
         c, h, cal = rows.lights[k], rows.h[k], rows.cal[k]
@@ -228,47 +247,48 @@ def _update_one(s: int, seen: Assigned, pixels: _Rows, rows: _Rows, rules: BankR
         Z[2 * a + 1, 2 * a] += cov[1, 0]
         Z[2 * a + 1, 2 * a + 1] += cov[1, 1]
     if math.isnan(factor(Z, 2 * m)):
+        shrink(P, G[:0], rules.estimated, updated.P[s])
         return  # nothing is learned from what cannot be solved: the subset stays as wide as it was predicted
     whiten_gains(Z, G)
     whiten_innovation(Z, nu, w)
     for q in range(2 * m):
         for i in range(rules.estimated):
             offset[i] += w[q] * G[q, i]
-    shrink(P, G, rules.estimated)
+    shrink(P, G, rules.estimated, updated.P[s])
 
 
 @part
 def _update_flattened(
     s: int,
+    first: Array,
+    P: Array,
     station: Lights,
     state: FilterState,
     seen: Assigned,
     pixels: _Rows,
     rules: BankRules,
     work: _Work,
-    bank: Bank,
+    updated: Bank,
 ) -> None:
     """Update one subset that sees a single plane; at a start ever flatter until its tilt's covariance grows no more."""
-    turn_cov, first, P = np.empty((3, 3)), bank.offset[s].copy(), bank.P[s].copy()
+    turn_cov = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             turn_cov[i, j] = rules.turn_cov[i, j] if rules.starting else P[3 + i, 3 + j]
     flat = FilterState(state.R.copy(), state.t.copy(), state.x, state.P)
     for _ in range(_FLATTENINGS if rules.starting else 1):
-        copy_to(first, bank.offset[s])
-        for i in range(len(P)):
-            copy_to(P[i], bank.P[s, i])
         set_pose(flat.R, flat.t, state.R, state.t)
-        flatten(state.R, state.t, rules.planes[bank.plane[s]], turn_cov, flat.R, flat.t)
+        flatten(state.R, state.t, rules.planes[updated.plane[s]], turn_cov, flat.R, flat.t)
         rows = _rows(station, flat, seen.assignment)
-        _update_one(s, seen, pixels, rows if len(rows.lights) == len(pixels.lights) else pixels, rules, work, bank)
-        before, after = 0.0, 0.0
+        rows = rows if len(rows.lights) == len(pixels.lights) else pixels
+        _update_one(s, first, P, seen, pixels, rows, rules, work, updated)
+        wider, widest = 0.0, 0.0
         for i in range(3):
-            before += turn_cov[i, i]
-            after += bank.P[s, 3 + i, 3 + i]
+            widest += turn_cov[i, i]
+            wider += updated.P[s, 3 + i, 3 + i]
             for j in range(3):
-                turn_cov[i, j] = bank.P[s, 3 + i, 3 + j]
-        if after < _FLATTENED * before:
+                turn_cov[i, j] = updated.P[s, 3 + i, 3 + j]
+        if wider < _FLATTENED * widest:
             break
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lumidock._kernels.compiling import entry, part
+from lumidock._kernels.compiling import entry, fast_part, part
 from lumidock._kernels.lens import inside, rotate_exp
 from lumidock._kernels.pose import attitude_error, light_row, set_pose
 from lumidock._kernels.visibility import EDGE_PX, faces
@@ -208,24 +208,17 @@ def row(lights: Lights, state: FilterState, c: int, at: Array, h: Array, cal: Ar
     return True
 
 
-@part
+@fast_part
 def gains(P: Array, h: Array, cal: Array, c: int, gu: Array, gv: Array) -> None:
-    """P H^T of both rows of light `c`, (n,) each."""
-    n = len(P)
+    """P H^T of both rows of light `c`, (n,) each. One loop, in which every number of `P` is read once."""
     base = LIGHTS + 3 * c
-    for i in range(n):
-        gu[i] = cal[0] * P[CALIBRATION, i] + P[CALIBRATION + 1, i]
-        gv[i] = cal[1] * P[CALIBRATION, i] + P[CALIBRATION + 2, i]
-    for k in range(6):
-        a, b = h[2 + k], h[8 + k]
-        for i in range(n):
-            gu[i] += a * P[k, i]
-            gv[i] += b * P[k, i]
-    for k in range(3):
-        a, b = h[2 + k], h[8 + k]
-        for i in range(n):
-            gu[i] += a * P[base + k, i]
-            gv[i] += b * P[base + k, i]
+    for i in range(len(P)):
+        u = cal[0] * P[CALIBRATION, i] + P[CALIBRATION + 1, i]
+        v = cal[1] * P[CALIBRATION, i] + P[CALIBRATION + 2, i]
+        x, y, z = P[0, i] + P[base, i], P[1, i] + P[base + 1, i], P[2, i] + P[base + 2, i]
+        a, b, d = P[3, i], P[4, i], P[5, i]
+        gu[i] = u + h[2] * x + h[3] * y + h[4] * z + h[5] * a + h[6] * b + h[7] * d
+        gv[i] = v + h[8] * x + h[9] * y + h[10] * z + h[11] * a + h[12] * b + h[13] * d
 
 
 @part

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lumidock._kernels.compiling import entry, part
+from lumidock._kernels.compiling import entry, fast_part, part
 from lumidock._kernels.lens import copy_to, factor
 from lumidock._kernels.matching.evidence import assigned_lights
 from lumidock._kernels.pose import set_pose
@@ -108,7 +108,7 @@ def update(station: Lights, predicted: FilterState, state: FilterState, seen: As
         if not _whiten(station, flat, seen, rows):
             return np.nan
         whiten_innovation(rows.Z, nu, w)
-    shrink(P, rows.G, estimated)
+    shrink(P, rows.G, estimated, P)
     return square
 
 
@@ -135,22 +135,26 @@ def _whiten(station: Lights, state: FilterState, seen: Assigned, rows: _Rows) ->
     return True
 
 
-@part
+@fast_part
 def whiten_gains(Z: Array, G: Array) -> None:
-    """L^-1 H P in place of `G` = H P (2 m, n), with the factor L in the lower triangle of `Z` (2 m, 2 m)."""
+    """L^-1 H P in place of `G` = H P (2 m, n), with the factor L in the lower triangle of `Z` (2 m, 2 m).
+
+    Four rows at a time: memory, not arithmetic, is what it waits for.
+    """
     n = G.shape[1]
     for r in range(len(G)):
-        for k in range(0, r - 1, 2):
-            y, z = Z[r, k], Z[r, k + 1]
+        fours = r - r % 4
+        for k in range(0, fours, 4):
+            a, b, c, d = Z[r, k], Z[r, k + 1], Z[r, k + 2], Z[r, k + 3]
             for j in range(n):
-                G[r, j] = G[r, j] - y * G[k, j] - z * G[k + 1, j]
-        if r % 2:
-            z = Z[r, r - 1]
+                G[r, j] -= a * G[k, j] + b * G[k + 1, j] + c * G[k + 2, j] + d * G[k + 3, j]
+        for k in range(fours, r):
+            a = Z[r, k]
             for j in range(n):
-                G[r, j] -= z * G[r - 1, j]
-        z = 1.0 / Z[r, r]
+                G[r, j] -= a * G[k, j]
+        a = 1.0 / Z[r, r]
         for j in range(n):
-            G[r, j] *= z
+            G[r, j] *= a
 
 
 @part
@@ -184,14 +188,24 @@ def whiten_innovation(Z: Array, nu: Array, w: Array) -> None:
         w[r] = s / Z[r, r]
 
 
-@part
-def shrink(P: Array, G: Array, estimated: int) -> None:
-    """Take the information of an update out of `P` (n, n), but not from what is only considered; `G` (2 m, n)."""
+@fast_part
+def shrink(P: Array, G: Array, estimated: int, out: Array) -> None:
+    """Take the information of an update out of `P` (n, n), but not from what is only considered; `G` (2 m, n).
+
+    The covariance goes to `out` (n, n), which may be `P` itself.
+    """
+    fours = len(G) - len(G) % 4
     for i in range(len(P)):
         end = i + 1 if i < estimated else estimated
-        for r in range(0, len(G), 2):
-            u, v = G[r, i], G[r + 1, i]
+        for j in range(i + 1):
+            out[i, j] = P[i, j]
+        for r in range(0, fours, 4):
+            a, b, c, d = G[r, i], G[r + 1, i], G[r + 2, i], G[r + 3, i]
             for j in range(end):
-                P[i, j] = P[i, j] - u * G[r, j] - v * G[r + 1, j]
-        for j in range(end):
-            P[j, i] = P[i, j]
+                out[i, j] -= a * G[r, j] + b * G[r + 1, j] + c * G[r + 2, j] + d * G[r + 3, j]
+        for r in range(fours, len(G)):
+            a = G[r, i]
+            for j in range(end):
+                out[i, j] -= a * G[r, j]
+        for j in range(i):
+            out[j, i] = out[i, j]
