@@ -20,6 +20,7 @@ import numpy as np
 from lumidock.app.run import aid, process
 from lumidock.datatypes import Fix, Frame, Stage, Unusable
 from lumidock.errors import LumidockError
+from lumidock.go_no_go import Watch
 from lumidock.methods import Method
 from lumidock.streams.sensors import AidingFeed, SensorFeed
 from lumidock.streams.sinks import Sink
@@ -277,6 +278,7 @@ class Server:
     last: Fix | None = None
     contradiction: str = ""
     feed: SensorFeed = field(default_factory=lambda: AidingFeed(()))
+    watch: Watch | None = None  # of the go / no-go
     started_s: float = field(default_factory=time.monotonic)
 
     def serve(self, ready: Callable[[], None] = lambda: None) -> None:
@@ -325,6 +327,8 @@ class Server:
         if fix.contradiction is not None:
             self.contradiction = fix.contradiction.text
         self.last = fix
+        if self.watch is not None:
+            self.watch = self.watch.after(fix)
         return fix.stage
 
     def losses(self) -> dict[str, Any]:
@@ -358,6 +362,7 @@ class Server:
                 "exposure_factor": None if last is None or math.isnan(last.exposure_factor) else last.exposure_factor,
                 "latency_ms": percentiles([us / 1000.0 for us in list(self.latency_us)]),
             },
+            "go_no_go": self._advice(age_s),
             "sinks": {
                 worker.name: {
                     **{word: getattr(worker, word) for word in ("sent", "dropped", "stale", "errors", "problem")},
@@ -366,6 +371,14 @@ class Server:
                 for worker in self.workers
             },
         }
+
+    def _advice(self, age_s: float | None) -> dict[str, str] | None:
+        """The go / no-go as it is by now; None without the vehicle's size."""
+        if self.watch is None:
+            return None
+        t_ns = 0 if self.last is None or age_s is None else self.last.t_ns + round(age_s * 1e9)
+        advice = self.watch.advise(t_ns)
+        return {"verdict": advice.verdict, "word": advice.word}
 
 
 def percentiles(values: list[float]) -> dict[str, float]:

@@ -20,6 +20,7 @@ from lumidock.cli import (
     console,
     demo,
     designing,
+    docking,
     doctoring,
     evaluation,
     exporting,
@@ -62,6 +63,7 @@ from lumidock.cli.shared import (
     prepare_sequence,
     progress_bar,
     require_folder,
+    seeds_of,
     shipped_or_path,
     simulated,
     tell,
@@ -75,7 +77,6 @@ from lumidock.station import load_station
 if TYPE_CHECKING:
     from lumidock.cli.recordings import RunOptions
 
-_MAX_SEED = 10**9
 _COMMANDS = (
     evaluation,
     inspection,
@@ -88,6 +89,7 @@ _COMMANDS = (
     stations,
     setting_up,
     designing,
+    docking,
     demo,
     doctoring,
 )  # importing them adds their commands
@@ -392,7 +394,7 @@ def _campaign(
     campaign = plan(
         load_scenarios(scenarios, tuple(settings or ())),
         methods or METHODS[:1],
-        _seeds(seeds),
+        seeds_of(seeds),
         shipped_or_path("station", station) if station else None,
         shipped_or_path("camera", camera or DEFAULT_CAMERA),
         cold=cold,
@@ -410,14 +412,6 @@ def _campaign(
     print(markdown(table))
     ran = f"{speed:.0f} frames a second and core" if speed > 0.0 else "nothing was left to do"
     print(f"{ran}; written to {out}")
-
-
-def _seeds(text: str) -> tuple[int, int]:
-    """The two ends of A:B. Raises: InputError when they hold no seed."""
-    first, _, stop = text.partition(":")
-    if not (first.isdecimal() and stop.isdecimal() and int(first) < int(stop) <= _MAX_SEED):
-        raise InputError(f"--seeds {text}: wanted A:B, whole numbers, A below B")
-    return int(first), int(stop)
 
 
 @app.command("warm", epilog=example("lumidock warm"))

@@ -49,6 +49,7 @@ from lumidock.cli.shared import (
     warn_if_nothing_is_kept,
 )
 from lumidock.errors import InputError, extra
+from lumidock.go_no_go import DRIFT_M_S, Passage, Watch
 from lumidock.methods import localizer_of, require_method
 from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.sensors import AidingFeed, SensorFeed
@@ -89,6 +90,15 @@ MavlinkHeading = Annotated[
         min=-180.0,
         max=360.0,
         help="Compass heading of a vehicle that faces the dock head-on: the local frame is then north, east, down.",
+    ),
+]
+GoNoGoOption = Annotated[
+    str | None,
+    typer.Option(
+        "--go-no-go",
+        metavar="M[:M/S]",
+        help="Say go, hold or abort, in health and by MAVLink, to a vehicle of this cross-section radius that "
+        f"may move so fast unnoticed; {DRIFT_M_S:g} m/s unless given.",
     ),
 ]
 SensorsOption = Annotated[
@@ -144,6 +154,7 @@ def _serve(
     mavlink_id: MavlinkId = "1:197",
     mavlink_key: MavlinkKey = None,
     mavlink_heading: MavlinkHeading = None,
+    go_no_go: GoNoGoOption = None,
     sensors: SensorsOption = None,
     zenoh: ZenohOption = None,
     dds: Annotated[bool, typer.Option("--dds", help="Publish to ROS 2 by DDS.")] = False,
@@ -166,9 +177,7 @@ def _serve(
     options.settings()  # before anything is simulated
     network = Network(domain, host != _LOOPBACK)
     with ExitStack() as stack:
-        if source.startswith(SIM):
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            source = str(simulated(source, folder / "sequence", station, camera))
+        source = _simulated(stack, source, station, camera)
         recording = open_recording(source, options, network)
         tell(recording.notes)
         setting = Setting(recording.station, recording.calibration.camera, load_vehicle(vehicle) if vehicle else None)
@@ -180,13 +189,21 @@ def _serve(
         ]
         server = _server(recording, _ready_localizer(setting, recording), sinks, loop=loop)
         server.feed = _sensor_feed(stack, recording.source, sensors)
+        sinks += _go_no_go_sinks(server, setting, go_no_go, mavlink)
         page = LivePage(shown, server.health, recording.station_file, method, recording.config, vehicle)
         line = stack.enter_context(page.opened(host, health_port))
-        # last of all, so that a start that fails leaves what is on the disk alone
         sinks += [*_record_sinks(setting, record or [], force), *_folder_sinks(out, recording, setting, server, force)]
         print(line, file=sys.stderr if as_json else sys.stdout, flush=True)
         _serve_until_stopped(server)
     _print_end(server, as_json, live=recording.source.live)
+
+
+def _simulated(stack: ExitStack, source: str, station: str | None, camera: str | None) -> str:
+    """Where the source is: a scenario is rendered into a folder that lasts as long as the stack."""
+    if not source.startswith(SIM):
+        return source
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+    return str(simulated(source, folder / "sequence", station, camera))
 
 
 def _ready_localizer(setting: Setting, recording: Recording) -> methods.Method:
@@ -261,6 +278,27 @@ def _ros_sinks(setting: Setting, zenoh: str | None, dds: Network | None, domain:
     return workers
 
 
+def _go_no_go_sinks(server: Server, setting: Setting, given: str | None, mavlink: str | None) -> list[Worker]:
+    """Let the server say go or no-go, and send it by MAVLink to where the fixes go."""
+    if given is None:
+        return []
+    radius_m, _, drift_m_s = given.partition(":")
+    try:
+        size, drift = float(radius_m), float(drift_m_s or DRIFT_M_S)
+    except ValueError:
+        size = drift = math.nan
+    if not (0.0 < size < math.inf and 0.0 <= drift < math.inf):
+        raise InputError(f"--go-no-go {given}: wanted M or M:M/S, as 0.35:0.1 is one")
+    server.watch = Watch(Passage.of(setting.station, size), drift)
+    if mavlink is None:
+        return []
+    with extra("mavlink"):
+        from lumidock.streams.go_no_go_link import GoNoGoLink
+    name, port = _host_and_port("--mavlink", mavlink)
+    link = partial(GoNoGoLink, name, port, server.watch)
+    return [Worker("go-no-go", link, queue=1, stale_s=STALE_S, pictures=False)]
+
+
 def _sensor_feed(stack: ExitStack, opened: Source, sensors: str | None) -> SensorFeed:
     """The sensors of an autopilot, until the stack is closed; else those of a recording."""
     if sensors is None:
@@ -296,7 +334,7 @@ def _viewer_sinks(
 def _folder_sinks(
     out: Path | None, recording: Recording, setting: Setting, server: Server, force: bool
 ) -> list[Worker]:
-    """A run folder, locked and described. Raises: InputError where another process is writing a run there."""
+    """A run folder, locked and described; made last, so that a start that fails leaves the disk alone. Raises: InputError where another process is writing a run there."""
     if out is None:
         return []
     prepare_folder(out, force)

@@ -35,6 +35,7 @@ from lumidock.yamlfile import kind_of_file
 
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
+_MAX_SEED = 10**9
 _MAX_DELAY_MS = 10_000.0  # no camera on a vehicle is later
 SIM = "sim:"
 DEFAULT_STATION, DEFAULT_CAMERA = "cage-2x2x5", "imx264-60deg"
@@ -115,6 +116,14 @@ Fps = Annotated[
 ]
 Workers = Annotated[int | None, typer.Option("--workers", metavar="N", min=1, help="Processes; by default one a core.")]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from it.")]
+
+
+def seeds_of(text: str) -> tuple[int, int]:
+    """The two ends of A:B. Raises: InputError when they hold no seed."""
+    first, _, stop = text.partition(":")
+    if not (first.isdecimal() and stop.isdecimal() and int(first) < int(stop) <= _MAX_SEED):
+        raise InputError(f"--seeds {text}: wanted A:B, whole numbers, A below B")
+    return int(first), int(stop)
 
 
 def warn_if_nothing_is_kept() -> None:

@@ -32,3 +32,5 @@ class Draw(IntEnum):
     JELLYFISH = 21
     POINT_STREAM = 23
     AIDING = 22
+    STATION = 23
+    VEHICLE = 24

@@ -317,3 +317,17 @@ class AidingKnobs(KnobSection):
     velocity: DvlKnobs | None = None
     depth: DepthKnobs | None = None
     tilt: TiltKnobs | None = None
+
+
+class DockingKnobs(KnobSection):
+    """What a vehicle meets that steers itself into the dock; `path` then gives only the frame rate."""
+
+    current_m_s: Annotated[tuple[Reach, Reach], BeforeValidator(_pair), AfterValidator(_rising)] = (0.0, 0.5)  # speed
+    # 1 sigma of the turbulence over the speed of the current; 0.1 is usual in tidal flow near the bed
+    turbulence: Probability = 0.1
+    start_z_m: Annotated[tuple[Reach, Reach], BeforeValidator(_pair), AfterValidator(_rising)] = (18.0, 24.0)
+    start_off_m: Reach = 1.5  # distance from the axis in x and in y, 1 sigma
+    start_yaw_deg: Angle = 5.0  # heading error, 1 sigma
+    rocking_deg: Angle = 0.5  # largest roll and pitch of the vehicle in the waves
+    station_off_m: Reach = 0.0  # by which every light is off its surveyed position along each axis, 1 sigma
+    time_limit_s: Annotated[float, Field(ge=10.0, le=3600.0)] = 300.0

@@ -22,6 +22,7 @@ from lumidock.sim.knobs import (
     Counts,
     Daylight,
     Distance,
+    DockingKnobs,
     Interval,
     KnobSection,
     Lamps,
@@ -180,6 +181,7 @@ class Scenario(KnobSection):
     stream: StreamFaults = StreamFaults()
     faults: Faults = Faults()
     detections: DetectionKnobs = DetectionKnobs()
+    docking: DockingKnobs = DockingKnobs()
     config: dict[str, Any] = Field(default_factory=dict)  # configuration of the localizer that the scenario needs
     # of a scenario of faults: whether it lies within the assumptions of the safety case, at their edge, or outside
     assumptions: Literal["", "inside", "edge", "outside"] = ""
