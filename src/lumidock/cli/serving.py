@@ -177,9 +177,7 @@ def _serve(
     options.settings()  # before anything is simulated
     network = Network(domain, host != _LOOPBACK)
     with ExitStack() as stack:
-        source = _simulated(stack, source, station, camera)
-        recording = open_recording(source, options, network)
-        tell(recording.notes)
+        recording = _opened(stack, source, options, network)
         setting = Setting(recording.station, recording.calibration.camera, load_vehicle(vehicle) if vehicle else None)
         shown = live_view(setting.station, setting.camera) if wants_console(console, host) else None
         sinks = [
@@ -198,12 +196,14 @@ def _serve(
     _print_end(server, as_json, live=recording.source.live)
 
 
-def _simulated(stack: ExitStack, source: str, station: str | None, camera: str | None) -> str:
-    """Where the source is: a scenario is rendered into a folder that lasts as long as the stack."""
-    if not source.startswith(SIM):
-        return source
-    folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-    return str(simulated(source, folder / "sequence", station, camera))
+def _opened(stack: ExitStack, source: str, options: RunOptions, network: Network) -> Recording:
+    """The source, with what a person should know of it said; a scenario is rendered for as long as the stack lasts."""
+    if source.startswith(SIM):
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        source = str(simulated(source, folder / "sequence", options.station, options.camera))
+    recording = open_recording(source, options, network)
+    tell(recording.notes)
+    return recording
 
 
 def _ready_localizer(setting: Setting, recording: Recording) -> methods.Method:
@@ -334,7 +334,10 @@ def _viewer_sinks(
 def _folder_sinks(
     out: Path | None, recording: Recording, setting: Setting, server: Server, force: bool
 ) -> list[Worker]:
-    """A run folder, locked and described; made last, so that a start that fails leaves the disk alone. Raises: InputError where another process is writing a run there."""
+    """A run folder, locked and described; made last, so that a start that fails leaves the disk alone.
+
+    Raises: InputError where another process is writing a run there.
+    """
     if out is None:
         return []
     prepare_folder(out, force)

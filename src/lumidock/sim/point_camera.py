@@ -15,7 +15,7 @@ from lumidock.errors import InputError
 from lumidock.sim.course import Course, project_each, shines
 from lumidock.sim.detections import RunDraws, failed, run_draws, shown_layers
 from lumidock.sim.draws import Draw
-from lumidock.sim.point_faults import bent, glints, seen_glints
+from lumidock.sim.point_faults import Extras, bent, glints, no_lens_faults, seen_extras
 from lumidock.sim.scenario import R_DOCK_CAM_HEAD_ON, Scenario, poses, rotations, spurious_paths
 from lumidock.sim.stream import Row, rows_of
 from lumidock.station import Station
@@ -45,7 +45,7 @@ class PointCamera:
     drawn: RunDraws
     course: Course
     wander_uv: Array
-    glints: tuple[Array, np.ndarray]
+    glints: Extras
     attitude_bias_rad: Array
     front: np.ndarray
     shown: np.ndarray
@@ -111,9 +111,8 @@ class PointCamera:
                 np.minimum(high, lights_uv.max(axis=0) + margin),
             )
         new = low + self.rng.random((int(self.rng.poisson(knobs.clutter)), 2)) * (high - low)
-        if not self.glints[1].any():
-            return np.concatenate([self.wander_uv[number], new])
-        fixed = seen_glints(knobs, self.camera, one, self.glints, np.zeros(1, bool))[1]
+        glints = replace(self.glints, on=self.glints.on[number : number + 1])
+        fixed = seen_extras(knobs, self.camera, one, glints, no_lens_faults(1), np.zeros(1, bool))[1]
         return np.concatenate([self.wander_uv[number], new, fixed])
 
     def _p_rear(self, light: Indices) -> Array:
@@ -151,6 +150,8 @@ def point_camera(scenario: Scenario, station: Station, camera: Camera, seed: int
     )
     drawn = replace(drawn, p_dock=moved)
     bias = np.random.default_rng([seed, Draw.ATTITUDE]).normal(size=3)
+    front = station.layer == station.layers.index(station.layers_front_to_rear()[0])
+    glint_rng = np.random.default_rng([seed, Draw.STRUCTURE_GLINTS])
     return PointCamera(
         scenario,
         station,
@@ -160,9 +161,9 @@ def point_camera(scenario: Scenario, station: Station, camera: Camera, seed: int
         wander_uv=spurious_paths(
             scenario, t_ns, (camera.width, camera.height), np.random.default_rng([seed, Draw.WANDERING_LIGHTS])
         ),
-        glints=glints(knobs, drawn.p_dock, drawn.dead, np.random.default_rng([seed, Draw.STRUCTURE_GLINTS])),
+        glints=glints(knobs, drawn.p_dock, course, drawn.dead, ~front, rng=glint_rng),
         attitude_bias_rad=bias * np.deg2rad(knobs.attitude.bias_deg if knobs.attitude else 0.0),
-        front=station.layer == station.layers.index(station.layers_front_to_rear()[0]),
+        front=front,
         shown=shown_layers(scenario, station),
         rows={
             row.number: row for row in rows_of(scenario.stream, t_ns, np.random.default_rng([seed, Draw.STREAM_FAULTS]))
