@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from lumidock.docking.loop import Docking, DockingResult, Moment, run
-from lumidock.evaluation.campaign import worker_pool
+from lumidock.evaluation.workers import worker_pool
 
 _BLOCK = 5  # dockings of one method in one job
 Progress = Callable[[int, int | None], None]
