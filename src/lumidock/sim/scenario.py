@@ -45,9 +45,6 @@ _DEFAULT_STATION = "cage-2x2x5"
 _BETWEEN_DRAWS_S = 60.0  # more than the time after which every track is dropped
 
 
-_OF_DRAWS = {"count", "hold", "hold_deg_s", "z_m", "turn_deg", "tilt_deg"}  # settings of a path that only draws have
-
-
 class Path3D(KnobSection):
     """The camera's path.
 
@@ -82,10 +79,6 @@ class Path3D(KnobSection):
     def _path_has_frames(self) -> Self:
         if self.speed_spread_m_s >= self.speed_m_s:
             raise ValueError("speed_spread_m_s: has to be less than speed_m_s")
-        fields = type(self).model_fields  # a scenario that was written out names its defaults too
-        others = {name for name in _OF_DRAWS & self.model_fields_set if getattr(self, name) != fields[name].default}
-        if others and self.kind != "draws":
-            raise ValueError(f"{min(others)}: only a path of kind draws has it, and this is of kind {self.kind}")
         if self.kind == "draws":
             if self.count * self.hold > _MAX_FRAMES:
                 raise ValueError(f"count times hold is more than {_MAX_FRAMES} frames")
