@@ -153,13 +153,13 @@ def test_every_command_of_the_guide_runs(desk, approach):
     run_page(ROOT / "docs" / "guide.md", desk)
 
 
-@pytest.mark.parametrize("name", ["configuration.md", "simulator.md", "simulator-physics.md"])
+@pytest.mark.parametrize("name", ["configuration.md", "simulator.md", "simulator-physics.md", "closed-loop.md"])
 def test_every_command_of_the_other_pages_runs(desk, name):
     run_page(ROOT / "docs" / name, desk)
 
 
 def test_no_other_page_has_commands():
-    run = {"README.md", "guide.md", "configuration.md", "simulator.md", "simulator-physics.md"}
+    run = {"README.md", "guide.md", "configuration.md", "simulator.md", "simulator-physics.md", "closed-loop.md"}
     assert {page.name for page in PAGES if commands(page)} <= run
 
 

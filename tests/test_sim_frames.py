@@ -71,7 +71,7 @@ def test_same_seed_same_bytes_on_one_worker_or_two(tmp_path):
         written(tmp_path / folder, "approach", *settings, workers=workers, seed=seed)
     files = [path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*") if path.is_file()]
     same, different, _ = filecmp.cmpfiles(tmp_path / "one", tmp_path / "two", files, shallow=False)
-    assert len(same) == len(files) == 12
+    assert len(same) == len(files) == 13
     assert not different
     assert not filecmp.cmp(tmp_path / "one" / "truth.csv", tmp_path / "other" / "truth.csv", shallow=False)
     kinds = {row["kind"] for row in read(tmp_path / "one" / "spurious_truth.csv")}
@@ -246,7 +246,7 @@ def knob_names(section, prefix=""):
 
 
 @pytest.mark.parametrize(
-    "section", [name for name in Scenario.model_fields if name not in ("name", "about", "station", "config")]
+    "section", [name for name in Scenario.model_fields if name not in ("name", "about", "station", "config", "assumptions", "says")]
 )
 @pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")
 def test_absurd_settings_are_refused_or_simulated(section, tmp_path):

@@ -326,8 +326,9 @@ class FilesConfig(SettingsGroup):
     # and tape leave over some metres; a survey from images declares none
     layer_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.02
     # least 1 sigma of the focal length, relative, where the station file states no calibration_sigma: a board gives
-    # 0.5-1 %, and the refractive index of water lies between 1.333, fresh and warm, and 1.344, salt and cold
-    focal: Annotated[float, Field(ge=0.0, le=0.1)] = 0.01
+    # 0.2-1 %, and the refractive index of water lies between 1.333, fresh and warm, and 1.344, salt and cold; 0.7 %
+    # takes the guidance of a single ring of 2 m at the edge of the image
+    focal: Annotated[float, Field(ge=0.0, le=0.1)] = 0.005
 
 
 Quaternion = tuple[float, float, float, float]

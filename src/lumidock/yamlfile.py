@@ -9,6 +9,7 @@ from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from lumidock.errors import InputError
 
@@ -125,13 +126,19 @@ def validate(model: type[Model], content: dict[str, Any], origin: str) -> Model:
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        # an unknown key first: what is missing is often what it should have been
-        first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
+        first = _most_telling(error.errors())
         place = " ".join(".".join(str(part) for part in first["loc"] if not str(part).startswith("_")).split())
         message = first["msg"].removeprefix("Value error, ")
         if first["type"] == "extra_forbidden":
             message = f"unknown key{_known_keys(model, first['loc'])}"
         raise InputError(f"{origin}: {place + ': ' if place else ''}{message}") from None
+
+
+def _most_telling(errors: list[ErrorDetails]) -> ErrorDetails:
+    """The first error, or for a missing key an unknown one beside it, which often is the missing one misspelt."""
+    first = errors[0]
+    beside = (one for one in errors if one["type"] == "extra_forbidden" and one["loc"][:-1] == first["loc"][:-1])
+    return next(beside, first) if first["type"] == "missing" else first
 
 
 def kind_of_file(path: Path) -> str:

@@ -25,7 +25,8 @@ REASONS = {
         "Come nearer or turn toward the dock; add lights that stay in view (`lumidock station check`).",
     ),
     "too_many": Reason(
-        "The frame has more detections than the search can look at in its time.",
+        "The frame has more detections that look like lamps than the search can look at within "
+        "`match.max_work`.",
         "Dim the vehicle's own lamp, or use a detector that gives fewer false detections.",
     ),
     "ambiguous": Reason(
@@ -53,16 +54,17 @@ REASONS = {
         "Come nearer, light more lamps, survey the dock more exactly, or provide an attitude sensor.",
     ),
     "saturated": Reason(
-        "As `protection`, and the cores of the lights are overexposed.",
-        "Shorten the exposure.",
+        "The lights show too little for a valid pose, and their cores or the whole image are overexposed.",
+        "Shorten the exposure, or multiply it by the fix's `exposure_factor` ([how](detector.md#9-exposure)).",
     ),
     "calibration": Reason(
-        "What is seen contradicts the camera file.",
+        "What is seen contradicts the camera file; `run` and the report say what about it.",
         "Calibrate the camera in water, at the size and crop of these images.",
     ),
     "survey": Reason(
-        "What is seen contradicts the station file.",
-        "Survey the dock again.",
+        "What is seen contradicts the station file; `run` and the report name the light or the layer.",
+        "Survey the dock again, or state how far off its lights may be "
+        "([how](safety-case.md#how-smaller-errors-are-earned)).",
     ),
     "stale": Reason(
         "No light was seen for too long to go on predicting.",

@@ -384,7 +384,10 @@ def _campaign(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run scenarios x seeds x methods on bare detections, and count; `faults` stands for every shipped fault."""
+    """Run scenarios x seeds x methods on bare detections.
+
+    `faults` stands for every shipped scenario of a fault.
+    """
     from lumidock.evaluation.campaign import plan, prepare, run_campaign, tabulate
     from lumidock.evaluation.campaign_table import markdown
     from lumidock.sim.scenario import load_scenarios

@@ -68,7 +68,7 @@ def _dock(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Let a simulated vehicle dock by the fixes of a method; count successes, contacts and aborts."""
+    """Let a simulated vehicle dock by a method's fixes, and count."""
     from lumidock.docking.campaign import HEAD, counted, in_full, row, run_campaign
     from lumidock.docking.film import film
     from lumidock.docking.loop import Docking

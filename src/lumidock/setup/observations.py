@@ -16,6 +16,7 @@ from lumidock.station import Station
 
 LEAST_LIGHTS = 4  # three lights fit up to four poses, so a frame with fewer than four says nothing of positions
 Progress = Callable[[int, int | None], None]
+_ANY_ROLL = 1e-6  # share of approaches with any roll, the least that `prior.any_roll` takes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,8 +70,11 @@ def identify(
     """Associate the detections of each recording with the lights of `station`, as the localizer does.
 
     The station's declared sigmas decide how far a light may lie from where the file has it. Frames in which fewer than
-    four lights are identified are left out.
+    four lights are identified are left out. The vehicle is taken to be as upright as the prior says: a drawing of a
+    regular ring would fit itself turned, and no survey could begin.
     """
+    upright = config.prior.model_copy(update={"any_roll": min(_ANY_ROLL, config.prior.any_roll)})
+    config = config.model_copy(update={"prior": upright})
     rows: list[_Row | None] = []
     done = spans = 0
     for number, recording in enumerate(recordings):
