@@ -246,7 +246,12 @@ def knob_names(section, prefix=""):
 
 
 @pytest.mark.parametrize(
-    "section", [name for name in Scenario.model_fields if name not in ("name", "about", "station", "config", "assumptions", "says")]
+    "section",
+    [
+        name
+        for name in Scenario.model_fields
+        if name not in ("name", "about", "station", "config", "assumptions", "says")
+    ],
 )
 @pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")
 def test_absurd_settings_are_refused_or_simulated(section, tmp_path):

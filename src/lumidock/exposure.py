@@ -16,7 +16,7 @@ SHORTEN = 0.4  # factor of one step where light is saturated: how far it is over
 _LENGTHEN = 2.5  # largest factor of a step up, as large as that down
 _TARGET, _DARK = 0.5, 0.2  # light of the brightest core over saturation: wanted, and below which it is too dark
 _MOST_SATURATED = 0.5  # share of the lamps whose cores may be saturated: a near one may, if the far ones are seen
-_GLARE = 0.1  # share of the picture that is saturated, of which no lamp comes: 100 lamps 20 px wide fill 1 %
+GLARE = 0.1  # share of the picture that is saturated, of which no lamp comes: 100 lamps 20 px wide fill 1 %
 _GAMMA = 2.2  # grey level over saturation is light to the power of 1 / 2.2 (ITU-R BT.709), if it is not linear
 _SATURATED = 0.98  # of the saturated level, that the mean of a core has at least
 _DB = 20.0  # decibels of a gain of 10 (EMVA 1288)
@@ -36,7 +36,7 @@ def factor(levels: Array, glare: float, *, linear: bool) -> float:
     `levels` (N,): grey levels of the lamps' cores over the saturated one, in the plane where each is measured;
     `glare`: share of the picture that is saturated; `linear`: whether grey levels are proportional to light.
     """
-    if glare > _GLARE:
+    if glare > GLARE:
         return SHORTEN
     if not len(levels):
         return math.nan

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lumidock import acquisition, detect, integrity, layers, tracking, verify
+from lumidock import acquisition, detect, exposure, integrity, layers, tracking, verify
 from lumidock.acquisition import Moment
 from lumidock.camera import Camera
 from lumidock.config import Config
@@ -26,6 +26,7 @@ from lumidock.track import Track, learned_calibration, sees_two_layers, track_by
 from lumidock.tracking import Prediction
 
 _SHOWS_TOO_LITTLE = ("no_lights", "too_few", "inconsistent", "residual", "protection")
+_SHOWS_ANYTHING = ("too_many", "ambiguous", "unproven")  # in a picture that is overexposed as a whole
 
 
 class Localizer:
@@ -72,7 +73,8 @@ class Localizer:
             self.scan = detect.Scan(frame, self.config.detect, self.camera.focal_px[0] / self.camera.focal_px[1])
         predicted = tracking.predict(self.state, frame.t_ns, self.context)
         found = detect.lights(frame, self.config.detect, self.scan, predicted.windows())
-        return _overexposed(self._step(layers.label(frame, found, self.config.label, self.scan.saturated), predicted))
+        fix = self._step(layers.label(frame, found, self.config.label, self.scan.saturated), predicted)
+        return _overexposed(fix, self.scan.glare)
 
     def process_detections(self, detections: Detections) -> Fix:
         """The fix of one frame's detections, by a detector of one's own."""
@@ -90,10 +92,13 @@ class Localizer:
         return fix
 
 
-def _overexposed(fix: Fix) -> Fix:
-    """The same fix; where it lacks what the picture should show and that is too bright, `saturated` is the reason."""
-    bright = fix.exposure_factor < 1.0 and fix.reason in _SHOWS_TOO_LITTLE
-    return replace(fix, reason="saturated") if bright else fix
+def _overexposed(fix: Fix, glare: float) -> Fix:
+    """The same fix; where it lacks what the picture should show and that is too bright, `saturated` is the reason.
+
+    `glare`: share of the picture that is saturated.
+    """
+    words = _SHOWS_TOO_LITTLE + _SHOWS_ANYTHING * (glare > exposure.GLARE)
+    return replace(fix, reason="saturated") if fix.exposure_factor < 1.0 and fix.reason in words else fix
 
 
 def step(

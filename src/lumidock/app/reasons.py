@@ -25,8 +25,7 @@ REASONS = {
         "Come nearer or turn toward the dock; add lights that stay in view (`lumidock station check`).",
     ),
     "too_many": Reason(
-        "The frame has more detections that look like lamps than the search can look at within "
-        "`match.max_work`.",
+        "The frame has more detections that look like lamps than the search can look at within `match.max_work`.",
         "Dim the vehicle's own lamp, or use a detector that gives fewer false detections.",
     ),
     "ambiguous": Reason(

@@ -181,7 +181,7 @@ def _console(
     host: Annotated[str, typer.Option("--host", metavar="ADDRESS", help="Where the console listens.")] = _LOOPBACK,
     port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535)] = _PORT,
 ) -> None:
-    """Replay a recording in the console: step, compare, tune and report."""
+    """Replay a recording in the browser: step, compare and tune."""
     with extra("console"):
         from lumidock.app.console import server  # noqa: F401  # only whether it can be imported
     from lumidock.app.console.frame_view import Scene
