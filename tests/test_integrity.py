@@ -15,7 +15,7 @@ from lumidock.config import Config, IntegrityConfig
 from lumidock.datatypes import Guide, Protection
 from lumidock.evaluation import claims
 from lumidock.geometry import bearing_and_range, se3_exp, se3_inverse
-from lumidock.integrity import Bounds, bounds, guide_holds, pose_holds, sigma_factors
+from lumidock.integrity import Bounds, bounds, excess, guide_holds, pose_holds, sigma_factors
 from lumidock.model import station_model
 from lumidock.station import load_station
 from lumidock.track import NO_PLANE, FrameResult, LastSeen, Track
@@ -177,6 +177,13 @@ def bound_of(z, lateral=0.01, axial=0.01, angle=0.01, bearing=0.001, distance=0.
     T[0, 3] = x
     guide = Guide(*bearing_and_range(T), bearing, distance)
     return Bounds(T, np.eye(6), Protection(lateral, axial, angle), guide)
+
+
+def test_the_level_over_its_limit_by_the_largest_factor_is_named():
+    limit_m, _, limit_rad = DEFAULT_ALERT_LIMITS.of_pose(4.0, 0.0)
+    assert excess(bound_of(4.0), DEFAULT_ALERT_LIMITS) is None
+    found = excess(bound_of(4.0, lateral=2.0 * limit_m, angle=3.0 * limit_rad), DEFAULT_ALERT_LIMITS)
+    assert (found.of, found.limit, found.factor) == ("angle", limit_rad, pytest.approx(3.0))
 
 
 @pytest.mark.parametrize("z_m", [0.5, 2.0, 6.0, 20.0])

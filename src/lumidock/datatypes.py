@@ -304,6 +304,23 @@ class SensorUse:
         return f"{self.kind}={self.state}" + (f":{self.reason}" if self.reason else "")
 
 
+@dataclass(frozen=True, slots=True)
+class Excess:
+    """The protection level that is over its alert limit, of several the one by the larger factor.
+
+    `of`: lateral and axial in m, angle in rad.
+    """
+
+    of: Literal["lateral", "axial", "angle"]
+    level: float
+    limit: float
+
+    @property
+    def factor(self) -> float:
+        """Level over limit."""
+        return self.level / self.limit
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
     """A pose `T_dock_cam` (4, 4) that fits where none is proven, with its `probability` among those that fit."""
@@ -321,7 +338,8 @@ class Fix:
     innovation squared of a tracked frame over its degrees of freedom, 1 on average where noise is as stated; NaN
     without history. `n_seen` counts the frame's detections and `n_used` those behind the pose; `by_layer` holds what
     each layer's lights give alone, where a method works by layer. `alternatives`: the poses that fit while none is
-    proven, the likeliest first; never a fix. `contradiction`: what is wrong with which file, where that is the reason.
+    proven, the likeliest first; never a fix. `contradiction`: what is wrong with which file, where that is the reason;
+    `excess`: which level is too large, where the reason is `protection`.
     `velocity` comes with a pose or a guide from a method that knows it; `aiding` says what became of each sensor that
     has given values.
     """
@@ -342,6 +360,7 @@ class Fix:
     nis: float = math.nan
     alternatives: tuple[Alternative, ...] = ()
     contradiction: Contradiction | None = None
+    excess: Excess | None = None
     velocity: Velocity | None = None
     aiding: tuple[SensorUse, ...] = ()
 

@@ -18,6 +18,7 @@ from lumidock.datatypes import (
     Array,
     Contradiction,
     Detections,
+    Excess,
     Fix,
     Guide,
     Match,
@@ -138,9 +139,20 @@ def _apart(a: Track, b: Track) -> Array:
 
 def pose_holds(bound: Bounds, limits: AlertLimits) -> bool:
     """Whether the full pose's protection levels are inside the alert limits of the dock."""
+    return excess(bound, limits) is None
+
+
+def excess(bound: Bounds, limits: AlertLimits) -> Excess | None:
+    """The protection level of the pose that is over its alert limit by the largest factor; None where none is."""
     pl = bound.protection
     lateral_m, axial_m, angle_rad = limits.of_pose(float(bound.T_dock_cam[2, 3]), pl.axial_m)
-    return pl.lateral_m < lateral_m and pl.axial_m < axial_m and pl.angle_rad < angle_rad
+    levels = (
+        Excess("lateral", pl.lateral_m, lateral_m),
+        Excess("axial", pl.axial_m, axial_m),
+        Excess("angle", pl.angle_rad, angle_rad),
+    )
+    over = [one for one in levels if not one.level < one.limit]  # a level that is no number is over it
+    return max(over, key=lambda one: one.factor, default=None)
 
 
 def guide_holds(bound: Bounds, limits: AlertLimits) -> bool:
@@ -172,7 +184,8 @@ def assess(
     bound = bounds(state.hypotheses, context.model, config)
     against = _contradiction(state, context)
     doubt, limits = _doubt(state, context) or (against.file if against else ""), context.station.alert_limits
-    valid, used = not doubt and pose_holds(bound, limits), first.last.n_used
+    too_wide, used = excess(bound, limits), first.last.n_used
+    valid = not doubt and too_wide is None
     reason = "" if valid else doubt or _why_wide(state, config)
     now = stage(first, context.model) or state.stage
     contradicted = against is not None
@@ -193,6 +206,7 @@ def assess(
         guide=bound.guide if not doubt and guide_holds(bound, limits) else None,
         nis=first.last.nis / (2 * used) if status == "tracking" else math.nan,
         alternatives=alternatives(state.hypotheses) if reason in _OPEN else (),
+        excess=too_wide if reason == "protection" else None,
         contradiction=against if against and doubt == against.file else None,
         aiding=state.aiding.uses(detections.t_ns),
     )

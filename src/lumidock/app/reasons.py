@@ -49,7 +49,7 @@ REASONS = {
         "One frame: nothing. Many: check calibration and station file.",
     ),
     "protection": Reason(
-        "A pose was found, but its protection level is over the alert limit.",
+        "A pose was found, but its protection level is over the alert limit; `run` says which level, and by how much.",
         "Come nearer, light more lamps, survey the dock more exactly, or provide an attitude sensor.",
     ),
     "saturated": Reason(

@@ -34,6 +34,19 @@ class Contradicted:
 
 
 @dataclass(slots=True)
+class OverLimit:
+    """In how many `frames` one protection level was over its alert limit, and the `least` and `most` factor by it."""
+
+    frames: int = 0
+    least: float = math.inf
+    most: float = 0.0
+
+    def count(self, factor: float) -> None:
+        """Add one frame."""
+        self.frames, self.least, self.most = self.frames + 1, min(self.least, factor), max(self.most, factor)
+
+
+@dataclass(slots=True)
 class Summary:
     """Counts of a run, as they stand in run.json."""
 
@@ -50,6 +63,7 @@ class Summary:
     too_dark: int = 0
     log_exposure_factor: float = 0.0  # sum over these frames
     contradictions: dict[tuple[str, str], Contradicted] = field(default_factory=dict)
+    over_limit: dict[str, OverLimit] = field(default_factory=dict)
     nis_sum: float = 0.0
     nis_frames: int = 0
     latency_us: Counter[int] = field(default_factory=Counter)  # how often each occurred: a server runs for weeks
@@ -67,6 +81,8 @@ class Summary:
         self.stage[fix.stage] += fix.valid
         self.reason[fix.reason] += bool(fix.reason)
         self.first_error = self.first_error or error
+        if fix.excess is not None and math.isfinite(fix.excess.factor):
+            self.over_limit.setdefault(fix.excess.of, OverLimit()).count(fix.excess.factor)
         if (against := fix.contradiction) is not None:
             key = against.file, against.subject
             before = self.contradictions.get(key)
@@ -92,6 +108,10 @@ class Summary:
             "status": dict(self.status),
             "valid_by_stage": {name: count for name, count in self.stage.items() if count},
             "reason": {name: count for name, count in self.reason.items() if count},
+            "over_limit": {
+                of: {"frames": one.frames, "least": round(one.least, 3), "most": round(one.most, 3)}
+                for of, one in sorted(self.over_limit.items())
+            },
             "contradictions": [
                 {"file": file, "subject": subject, "frames": one.frames, "text": one.text}
                 for (file, subject), one in sorted(self.contradictions.items(), key=lambda item: -item[1].frames)

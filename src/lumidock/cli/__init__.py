@@ -294,6 +294,9 @@ def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:
         f"{counts['frames']} frames: {counts['valid']} valid, {counts['guide_only']} guide only, {none} no fix; "
         f"written to {out}"
     )
+    for of, over in counts["over_limit"].items():
+        factors = f"{over['least']:.3g} to {over['most']:.3g} times the alert limit"
+        print(f"protection: the level of the {of} error in {over['frames']} frames, {factors}")
     if counts["reason"]:
         print("not valid: " + ", ".join(f"{word} {count}" for word, count in sorted(counts["reason"].items())))
     asked = counts["exposure"]

@@ -184,7 +184,7 @@ def _mapped(pool: ProcessPoolExecutor, function: Callable[[Any], Any], items: It
     """`map` over worker processes that block SIGINT from their start on, so that only their parent handles Ctrl-C."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        return pool.map(function, items, chunksize=4)
+        return pool.map(function, items)  # one at a time: what has begun is finished after Ctrl-C
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
