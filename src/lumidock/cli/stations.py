@@ -68,8 +68,19 @@ def _print(result: dict[str, Any]) -> None:
         print(f"{row['layer']:10} {row['seen']:4}   {cells[0]:30}  {cells[1]}")
     _print_self_fits(result)
     print()
-    for text in result["failed"] or ["all checks passed"]:
-        print(text if not result["failed"] else f"FAILED: {text}")
+    print(_expected(result["corridor"]))
+    for text in result["failed"]:
+        print(f"FAILED: {text}")
+    if not result["failed"]:
+        print("all checks passed: enough lights in view, no wrong assignment or mirror image too close")
+
+
+def _expected(corridor: list[dict[str, Any]]) -> str:
+    """From where on the way a valid pose may be had."""
+    valid = [row["z_m"] for row in corridor if row["valid"]]
+    if not valid:
+        return "no valid pose is to be expected on the way, guidance at most"
+    return f"a valid pose is to be expected from z = {max(valid):g} m on, in {len(valid)} of {len(corridor)} rows"
 
 
 def _print_self_fits(result: dict[str, Any]) -> None:
