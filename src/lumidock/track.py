@@ -438,11 +438,9 @@ def _update(
     deviate = deviate_of(nis, 2 * sum(count) - (6 if guess else 0))
     result = FrameResult(assignment, count, plane, nis, deviate)
     seen_now = _seen(track, count)
-    return Track(
-        t_ns=track.t_ns,
-        began_ns=track.began_ns,
+    return replace(
+        track,
         state=state,
-        bank=track.bank,
         seen=seen_now,
         last=result,
         estimates_calibration=both,
@@ -492,10 +490,9 @@ def same(a: Track, b: Track) -> bool:
     """Whether two tracks are one: the same assignment, and poses a fraction of a sigma apart."""
     if (a.last.assignment != b.last.assignment).any():
         return False
-    R, t = a.state.R, a.state.t
-    apart = np.concatenate([R.T @ (b.state.t - t), 0.5 * _vee(R.T @ b.state.R)])
-    sigma = np.sqrt(np.diagonal(b.state.P)[:6])
-    return bool((np.abs(apart) < _SAME_SIGMA * sigma + 1e-9).all())
+    R = a.state.R
+    apart = np.concatenate([R.T @ (b.state.t - a.state.t), 0.5 * _vee(R.T @ b.state.R)])
+    return bool((np.abs(apart) < _SAME_SIGMA * np.sqrt(np.diagonal(b.state.P)[:6]) + 1e-9).all())
 
 
 def _vee(D: Array) -> Array:
