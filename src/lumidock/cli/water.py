@@ -74,6 +74,12 @@ def _water(
     target = _board(board, squares, (square, marker), dictionary)
     sightings, size = _sightings(cast("str", source), target, fps)
     found = calibrate(target, sightings, size, cast("Literal['plumb_bob', 'equidistant']", model), behind)
+    fitted = found.camera.port
+    if fitted is not None and not (0.0 <= fitted.distance_m <= 1.0 and 1.0 <= fitted.index <= 1.5):
+        raise InputError(
+            f"the views fit a port {fitted.distance_m:.3f} m away in water of index {fitted.index:.3f}, which is none; "
+            "give --port and --water-index as measured, or leave --port out"
+        )
     save_camera(found.camera, out)
     print(json.dumps(_as_dict(found), indent=1) if as_json else _told(found, len(sightings), out))
 
