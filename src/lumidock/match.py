@@ -443,8 +443,7 @@ def _mirror_evidence(task: _Search, top: Hypothesis, *, all_mirrors: bool) -> fl
         found, complete = _search(task, task.mirrored(mirror), n, least, best=top.log_evidence)
         if not complete:
             return None
-        camera_y = -np.einsum("ki,ki->k", found.R[:, :, 1], found.t)
-        possible = (camera_y < 0.0) | all_mirrors
+        possible = _may_be_in_surface(found, task, mirror) | all_mirrors
         total = float(np.logaddexp.reduce([total, *found.log_evidence[possible]]))
     return total + task.config.log_mirror
 
@@ -458,6 +457,18 @@ def alike(assignment: Indices, others: Indices) -> np.ndarray:
     shared = (both & (assignment == others)).sum(axis=1)
     other = (both & (assignment != others)).sum(axis=1)
     return np.asarray((shared >= POSE_LIGHTS) & (other <= 1))
+
+
+def _may_be_in_surface(found: Hypotheses, task: _Search, mirror: Array) -> np.ndarray:
+    """Whether each of some mirror images may stand above the surface, and so above the camera (K,).
+
+    Its centre has to; and all of its lights, where the vehicle's tilt is known well enough to tell.
+    """
+    camera_y = -np.einsum("ki,ki->k", found.R[:, :, 1], found.t)
+    tilt_rad = 1.0 / math.sqrt(float(task.problem.info[:2].min()))
+    open_m = task.config.roll_gate * tilt_rad * np.linalg.norm(found.t, axis=1)
+    lowest = float((task.problem.p * mirror)[:, 1].min())
+    return np.asarray((camera_y < 0.0) & (camera_y - open_m < lowest))
 
 
 def conflicts(assignment: Indices, others: Indices) -> np.ndarray:
