@@ -14,6 +14,7 @@ from zenoh.ext import Int64, z_deserialize
 
 from lumidock.datatypes import Fix, Frame, Velocity
 from lumidock.streams import rostypes
+from lumidock.streams.ros2 import Publication
 from lumidock.streams.rostypes import dds_name
 from lumidock.streams.vehicle import Vehicle
 from lumidock.streams.zenohlink import ZenohLink
@@ -34,7 +35,7 @@ def test_ros2_messages_go_over_zenoh(router):
     watcher = router.session.liveliness().declare_subscriber(
         "@ros2_lv/5/**", lambda sample: tokens.append(str(sample.key_expr)), history=True
     )
-    link = ZenohLink(router.endpoint, 5, CAMERA, MOUNTED, ("A",))
+    link = ZenohLink(router.endpoint, 5, Publication(CAMERA, MOUNTED, ("A",)))
     wait_for(lambda: len(tokens) >= 8)
 
     def all_received():
@@ -61,7 +62,7 @@ def test_ros2_messages_go_over_zenoh(router):
 
 
 def test_without_a_router_nothing_waits():
-    link = ZenohLink("tcp/127.0.0.1:1", 0, CAMERA, None, ("A",))
+    link = ZenohLink("tcp/127.0.0.1:1", 0, Publication(CAMERA, None, ("A",)))
     begin = time.monotonic()
     for _ in range(50):
         link.add(FRAME, FIX, 1500)
@@ -71,7 +72,7 @@ def test_without_a_router_nothing_waits():
 
 def test_an_endpoint_that_is_none_is_an_error():
     with pytest.raises(OSError, match="nonsense"):
-        ZenohLink("nonsense", 0, CAMERA, None, ("A",))
+        ZenohLink("nonsense", 0, Publication(CAMERA, None, ("A",)))
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="cyclonedds has no wheels for this machine")
@@ -82,7 +83,7 @@ def test_ros2_messages_go_over_dds():
 
     from lumidock.streams.ddslink import DdsLink, dds_type
 
-    link = DdsLink(78, False, CAMERA, MOUNTED, ("A",))
+    link = DdsLink(78, False, Publication(CAMERA, MOUNTED, ("A",)))
     participant = DomainParticipant(78)
     readers = {
         topic: DataReader(participant, Topic(participant, f"rt{topic}", dds_type(rostypes.TYPES[topic])))

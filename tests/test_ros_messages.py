@@ -13,6 +13,7 @@ from test_run import CAMERA
 
 from lumidock.datatypes import Fix, Frame, Velocity
 from lumidock.geometry import se3_exp, se3_inverse
+from lumidock.go_no_go import Passage, Watch
 from lumidock.streams.ros2 import Publication
 from lumidock.streams.rostypes import TYPES, UNKNOWN_VARIANCE, typestore
 from lumidock.streams.vehicle import Vehicle
@@ -140,6 +141,20 @@ def test_diagnostics_come_once_a_second_and_tell_what_is_wrong():
         told = published(fix, publication=publication).get("/diagnostics", [])
         levels += [(message.status[0].level, message.status[0].message) for message in told]
     assert levels == [(1, "no lights"), (0, "pose"), (2, "bad frame")]
+
+
+def test_diagnostics_say_go_or_no_go_where_a_watch_is_kept():
+    passage = Passage(opening_m=1.0, vehicle_m=0.3)
+    beside = HEAD_ON.copy()
+    beside[:3, 3] = 1.5, 0.0, 2.5
+    said = []
+    for T_dock_cam in (HEAD_ON, beside):
+        fix = Fix("a", SECOND, "tracking", "front", T_dock_cam=T_dock_cam)
+        publication = Publication(CAMERA, None, ("A",), Watch(passage))
+        (message,) = published(fix, publication=publication)["/diagnostics"]
+        told = message.status[1]
+        said.append((told.name, told.level, {one.key: one.value for one in told.values}["verdict"]))
+    assert said == [("lumidock: go / no-go", 0, "go"), ("lumidock: go / no-go", 1, "hold")]
 
 
 def test_the_page_lists_every_topic():

@@ -51,6 +51,7 @@ from lumidock.cli.shared import (
 from lumidock.errors import InputError, extra
 from lumidock.go_no_go import DRIFT_M_S, Passage, Watch
 from lumidock.methods import localizer_of, require_method
+from lumidock.station import Station
 from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.sensors import AidingFeed, SensorFeed
 from lumidock.streams.sinks import FILE_KINDS, Numbered, Setting, Sink, open_rerun
@@ -178,16 +179,16 @@ def _serve(
     network = Network(domain, host != _LOOPBACK)
     with ExitStack() as stack:
         recording = _opened(stack, source, options, network)
-        setting = Setting(recording.station, recording.calibration.camera, load_vehicle(vehicle) if vehicle else None)
+        setting = _setting(recording, vehicle, go_no_go)
         shown = live_view(setting.station, setting.camera) if wants_console(console, host) else None
         sinks = [
             *_mavlink_sinks(setting, mavlink, mavlink_id, mavlink_key, mavlink_heading),
+            *_go_no_go_sinks(setting.watch, mavlink),
             *_ros_sinks(setting, zenoh, network if dds else None, domain),
             *_viewer_sinks(setting, foxglove_port if foxglove else None, rerun, host, shown),
         ]
         server = _server(recording, _ready_localizer(setting, recording), sinks, loop=loop)
-        server.feed = _sensor_feed(stack, recording.source, sensors)
-        sinks += _go_no_go_sinks(server, setting, go_no_go, mavlink)
+        server.feed, server.watch = _sensor_feed(stack, recording.source, sensors), setting.watch
         page = LivePage(shown, server.health, recording.station_file, method, recording.config, vehicle)
         line = stack.enter_context(page.opened(host, health_port))
         sinks += [*_record_sinks(setting, record or [], force), *_folder_sinks(out, recording, setting, server, force)]
@@ -264,24 +265,31 @@ def _mavlink_sinks(
 
 
 def _ros_sinks(setting: Setting, zenoh: str | None, dds: Network | None, domain: int) -> list[Worker]:
-    workers, shared = [], (setting.camera, setting.vehicle, setting.station.ids)
+    workers = []
     if zenoh is not None:
         if not _ENDPOINT.fullmatch(zenoh):
             raise InputError(f"--zenoh {zenoh}: wanted an endpoint, as tcp/127.0.0.1:7447 is one")
         with extra("zenoh"), extra("bag"):
             from lumidock.streams.zenohlink import ZenohLink
-        workers.append(Worker("zenoh", partial(ZenohLink, zenoh, domain, *shared), queue=_SHORT))
+        workers.append(Worker("zenoh", partial(ZenohLink, zenoh, domain, setting.publication()), queue=_SHORT))
     if dds is not None:
         with extra("dds"), extra("bag"):
             from lumidock.streams.ddslink import DdsLink
-        workers.append(Worker("dds", partial(DdsLink, dds.domain, dds.everywhere, *shared), queue=_SHORT))
+        workers.append(Worker("dds", partial(DdsLink, dds.domain, dds.everywhere, setting.publication()), queue=_SHORT))
     return workers
 
 
-def _go_no_go_sinks(server: Server, setting: Setting, given: str | None, mavlink: str | None) -> list[Worker]:
-    """Let the server say go or no-go, and send it by MAVLink to where the fixes go."""
+def _setting(recording: Recording, vehicle: Path | None, go_no_go: str | None) -> Setting:
+    """What the sinks need: dock, camera, its mounting, and by what go or no-go is said."""
+    mounting = load_vehicle(vehicle) if vehicle else None
+    watch = _watch(go_no_go, recording.station)
+    return Setting(recording.station, recording.calibration.camera, mounting, watch)
+
+
+def _watch(given: str | None, station: Station) -> Watch | None:
+    """What go or no-go is said by, where `--go-no-go` asks for it."""
     if given is None:
-        return []
+        return None
     radius_m, _, drift_m_s = given.partition(":")
     try:
         size, drift = float(radius_m), float(drift_m_s or DRIFT_M_S)
@@ -289,13 +297,17 @@ def _go_no_go_sinks(server: Server, setting: Setting, given: str | None, mavlink
         size = drift = math.nan
     if not (0.0 < size < math.inf and 0.0 <= drift < math.inf):
         raise InputError(f"--go-no-go {given}: wanted M or M:M/S, as 0.35:0.1 is one")
-    server.watch = Watch(Passage.of(setting.station, size), drift)
-    if mavlink is None:
+    return Watch(Passage.of(station, size), drift)
+
+
+def _go_no_go_sinks(watch: Watch | None, mavlink: str | None) -> list[Worker]:
+    """Go or no-go by MAVLink to where the fixes go."""
+    if watch is None or mavlink is None:
         return []
     with extra("mavlink"):
         from lumidock.streams.go_no_go_link import GoNoGoLink
     name, port = _host_and_port("--mavlink", mavlink)
-    link = partial(GoNoGoLink, name, port, server.watch)
+    link = partial(GoNoGoLink, name, port, watch)
     return [Worker("go-no-go", link, queue=1, stale_s=STALE_S, pictures=False)]
 
 
@@ -321,8 +333,7 @@ def _viewer_sinks(
     if foxglove_port is not None:
         with extra("live"), extra("bag"):
             from lumidock.streams.foxglovelive import FoxgloveLive
-        shared = (setting.camera, setting.vehicle, setting.station.ids)
-        server = partial(FoxgloveLive, host, foxglove_port, *shared)
+        server = partial(FoxgloveLive, host, foxglove_port, setting.publication())
         workers.append(Worker("foxglove", server, queue=_SHORT, patient=True))
     if rerun is not None:
         if not rerun.startswith("rerun+http"):

@@ -8,11 +8,9 @@ from cyclonedds.core import DDSException, Policy, Qos
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
-from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
 from lumidock.streams import ros2, rostypes
 from lumidock.streams.ddstypes import as_dds, dds_type, participant
-from lumidock.streams.vehicle import Vehicle
 
 _TOPICS = tuple(t for t in rostypes.TYPES if not t.startswith((f"{rostypes.PREFIX}/image", f"{rostypes.PREFIX}/annot")))
 
@@ -20,16 +18,14 @@ _TOPICS = tuple(t for t in rostypes.TYPES if not t.startswith((f"{rostypes.PREFI
 class DdsLink:
     """Publishes in a domain of DDS, on this machine only or on every interface."""
 
-    def __init__(
-        self, domain: int, everywhere: bool, camera: Camera, vehicle: Vehicle | None, light_ids: tuple[str, ...]
-    ) -> None:
+    def __init__(self, domain: int, everywhere: bool, publication: ros2.Publication) -> None:
         """Join `domain`. Raises: OSError when that cannot be."""
         self._participant = participant(domain, everywhere)
         try:
             self._writers = {topic: self._writer(topic) for topic in _TOPICS}
         except DDSException as error:
             raise OSError(f"DDS domain {domain}: {error}") from None
-        self._publication = ros2.Publication(camera, vehicle, light_ids)
+        self._publication = publication
 
     def _writer(self, topic: str) -> DataWriter[Any]:
         last = Policy.Durability.TransientLocal if topic == "/tf_static" else Policy.Durability.Volatile

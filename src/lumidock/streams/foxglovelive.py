@@ -5,10 +5,8 @@ from __future__ import annotations
 import foxglove
 from foxglove import Channel, Schema
 
-from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
 from lumidock.streams import ros2, rostypes
-from lumidock.streams.vehicle import Vehicle
 
 _BACKLOG = 32  # messages that a client may be behind before the oldest are dropped
 
@@ -16,9 +14,7 @@ _BACKLOG = 32  # messages that a client may be behind before the oldest are drop
 class FoxgloveLive:
     """A server that Foxglove connects to; a client that does not keep up loses messages, not we time."""
 
-    def __init__(
-        self, host: str, port: int, camera: Camera, vehicle: Vehicle | None, light_ids: tuple[str, ...]
-    ) -> None:
+    def __init__(self, host: str, port: int, publication: ros2.Publication) -> None:
         """Listen on `host`, `port`. Raises: OSError when that cannot be."""
         self._context = foxglove.Context()
         try:
@@ -27,7 +23,7 @@ class FoxgloveLive:
             )
         except (RuntimeError, OSError) as error:
             raise OSError(f"{host}:{port}: {error}") from None
-        self._publication = ros2.Publication(camera, vehicle, light_ids)
+        self._publication = publication
         self._channels = {
             topic: Channel(
                 topic,

@@ -7,10 +7,8 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
 from lumidock.streams import ros2, rostypes
-from lumidock.streams.vehicle import Vehicle
 
 _FLUSH_S = 0.2  # what a killed run may lose, and what the next look at the clock takes
 
@@ -18,7 +16,7 @@ _FLUSH_S = 0.2  # what a killed run may lose, and what the next look at the cloc
 class McapFile:
     """Writes every frame's messages; a file that was cut short can be read but for its last moment."""
 
-    def __init__(self, path: Path, camera: Camera, vehicle: Vehicle | None, light_ids: tuple[str, ...]) -> None:
+    def __init__(self, path: Path, publication: ros2.Publication) -> None:
         """Start the file, replacing one that is there."""
         self._file = path.open("wb")
         self._writer = Writer(self._file, chunk_size=1 << 20, compression=CompressionType.LZ4)
@@ -26,7 +24,7 @@ class McapFile:
         for kind in set(rostypes.TYPES.values()):
             rostypes.definition(kind)  # takes a moment at first use, before there are frames
         self._writer.flush()
-        self._publication = ros2.Publication(camera, vehicle, light_ids)
+        self._publication = publication
         self._channels: dict[str, int] = {}
         self._flushed = time.monotonic()
 

@@ -6,7 +6,7 @@ row by row in x, y, z and rotations about the fixed axes of the dock; quaternion
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from lumidock.camera import Camera
 from lumidock.datatypes import Array, Detections, Fix, Frame, Unusable
 from lumidock.geometry import se3_inverse, skew
+from lumidock.go_no_go import WORDS, Verdict, Watch
 from lumidock.streams import rospicture
 from lumidock.streams.rostypes import (
     DOCK_POSE,
@@ -36,13 +37,17 @@ _MEASURED = ("acquired", "tracking")  # fixes that a filter may take; a predicte
 _T_DOCK_ENTRY = np.array([[0.0, -1, 0, 0], [0, 0, 1, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
 _BROKEN = ("bad_frame", "bad_stamp", "frozen", "calibration", "survey")  # reasons that somebody has to look into
 _OK, _WARN, _ERROR = range(3)  # levels of diagnostic_msgs/DiagnosticStatus
+_VERDICTS: dict[Verdict, int] = {"go": _OK, "hold": _WARN, "abort": _ERROR}
 
 
 class Publication:
     """Makes the messages of one frame after the other."""
 
-    def __init__(self, camera: Camera, vehicle: Vehicle | None, light_ids: tuple[str, ...]) -> None:
-        self._camera, self._vehicle, self._light_ids = camera, vehicle, light_ids
+    def __init__(
+        self, camera: Camera, vehicle: Vehicle | None, light_ids: tuple[str, ...], watch: Watch | None = None
+    ) -> None:
+        """Messages of one camera; with a `watch` the diagnostics say go or no-go too."""
+        self._camera, self._vehicle, self._light_ids, self._watch = camera, vehicle, light_ids, watch
         self._dock, self._cam, self._way = "dock", "camera_optical", "camera_to_dock"
         if vehicle is not None:
             self._dock, self._cam, self._way = vehicle.dock_frame, vehicle.camera_frame, vehicle.transform
@@ -55,6 +60,7 @@ class Publication:
         if item.t_ns is None:
             return
         t_ns = item.t_ns
+        self._watch = self._watch.after(fix) if self._watch else None
         yield serialized(f"{PREFIX}/status", t_ns, self._status(fix, t_ns, latency_us))
         if self._slow_ns is None or abs(t_ns - self._slow_ns) >= _SLOWLY_NS:
             self._slow_ns = t_ns
@@ -137,9 +143,17 @@ class Publication:
             text = f"bearing and range only: {text}"
         words = {"status": fix.status, "stage": fix.stage, "reason": fix.reason}
         words |= {"detections": str(fix.n_seen), "lights used": str(fix.n_used)}
-        values = [make("diagnostic_msgs/msg/KeyValue", key, value) for key, value in words.items()]
-        status = make("diagnostic_msgs/msg/DiagnosticStatus", level, "lumidock: fix", text, "lumidock", values)
-        return make("diagnostic_msgs/msg/DiagnosticArray", header(t_ns, self._dock), [status])
+        told = [_diagnostic(level, "lumidock: fix", text, words)]
+        if self._watch:
+            advice = self._watch.advise(t_ns)
+            words = {"verdict": advice.verdict, "word": advice.word}
+            told.append(_diagnostic(_VERDICTS[advice.verdict], "lumidock: go / no-go", WORDS[advice.word], words))
+        return make("diagnostic_msgs/msg/DiagnosticArray", header(t_ns, self._dock), told)
+
+
+def _diagnostic(level: int, name: str, text: str, words: Mapping[str, str]) -> Any:  # noqa: ANN401
+    values = [make("diagnostic_msgs/msg/KeyValue", key, value) for key, value in words.items()]
+    return make("diagnostic_msgs/msg/DiagnosticStatus", level, name, text, "lumidock", values)
 
 
 def _transforms(topic: str, t_ns: int, transform: Any) -> Serialized:  # noqa: ANN401

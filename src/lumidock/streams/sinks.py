@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Image, Unusable
 from lumidock.errors import InputError, extra
+from lumidock.go_no_go import Watch
 from lumidock.picture import developed
 from lumidock.station import Station
 from lumidock.streams.overlay import draw, whole
 from lumidock.streams.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from lumidock.streams.ros2 import Publication
 
 FILE_KINDS = (".mcap", ".rrd", ".mp4")
 _WIDTH = 1224  # of an annotated video, px
@@ -32,11 +36,21 @@ class Sink(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What every sink needs beside the fixes: the dock, the camera and how it is mounted on the vehicle."""
+    """What every sink needs beside the fixes: the dock, the camera and how it is mounted on the vehicle.
+
+    `watch`: where go or no-go is to be said, what it says it by.
+    """
 
     station: Station
     camera: Camera
     vehicle: Vehicle | None = None
+    watch: Watch | None = None
+
+    def publication(self) -> Publication:
+        """The fixes as ROS 2 messages. Raises: InputError where the extra `bag` is not installed."""
+        with extra("bag"):
+            from lumidock.streams.ros2 import Publication
+        return Publication(self.camera, self.vehicle, self.station.ids, self.watch)
 
 
 def open_file_sink(path: Path, setting: Setting) -> Sink:
@@ -44,7 +58,7 @@ def open_file_sink(path: Path, setting: Setting) -> Sink:
     if path.suffix == ".mcap":
         with extra("bag"):
             from lumidock.streams.mcapfile import McapFile
-        return McapFile(path, setting.camera, setting.vehicle, setting.station.ids)
+        return McapFile(path, setting.publication())
     if path.suffix == ".rrd":
         return open_rerun(str(path), setting)
     if path.suffix == ".mp4":

@@ -8,10 +8,8 @@ import time
 import zenoh
 from zenoh.ext import Int64, z_serialize
 
-from lumidock.camera import Camera
 from lumidock.datatypes import Detections, Fix, Frame, Unusable
 from lumidock.streams import ros2, rostypes
-from lumidock.streams.vehicle import Vehicle
 from lumidock.streams.zenohsession import is_connected, nobody_at, open_session, wait_for_router
 
 _NODE, _LOOK_S = "lumidock", 0.5
@@ -21,15 +19,13 @@ _QOS = "::,10:,:,:,,"  # the defaults of ROS 2: reliable, volatile, the last ten
 class ZenohLink:
     """Publishes to the zenoh router or peer at `endpoint`; where there is none, messages are dropped, not kept."""
 
-    def __init__(
-        self, endpoint: str, domain: int, camera: Camera, vehicle: Vehicle | None, light_ids: tuple[str, ...]
-    ) -> None:
+    def __init__(self, endpoint: str, domain: int, publication: ros2.Publication) -> None:
         """Connect to `endpoint`, tcp/HOST:PORT, and to nothing else; it need not be there yet.
 
         Raises: OSError for an endpoint that is none.
         """
         self._endpoint, self._session = endpoint, open_session(endpoint)
-        self._publication = ros2.Publication(camera, vehicle, light_ids)
+        self._publication = publication
         self._id = str(self._session.zid())
         self._gid = bytes.fromhex(self._id.rjust(32, "0"))
         self._publishers, self._sequence = dict[str, zenoh.Publisher](), 0
