@@ -12,7 +12,7 @@ from test_sources import write_video
 
 from lumidock import cli, methods
 from lumidock.camera import save_camera
-from lumidock.cli import shared
+from lumidock.cli import progress as progress_lines
 from lumidock.datatypes import Fix, Guide, Protection
 from lumidock.sim.scenario import shipped_scenarios
 
@@ -48,8 +48,8 @@ def test_the_version_is_printed_and_nothing_else_done(lumidock):
 
 
 def test_progress_without_a_terminal_is_plain_lines(monkeypatch, capsys):
-    monkeypatch.setattr(shared, "PLAIN_EVERY_S", 0.0)
-    with shared.progress_bar("simulating") as progress:
+    monkeypatch.setattr(progress_lines, "PLAIN_EVERY_S", 0.0)
+    with progress_lines.progress_bar("simulating") as progress:
         for done in (1, 2, 4):
             progress(done, 4)
         progress(5, None)
@@ -57,15 +57,27 @@ def test_progress_without_a_terminal_is_plain_lines(monkeypatch, capsys):
     assert re.fullmatch(r"simulating: 1 of 4, elapsed 0:00:0\d", lines[0])
     assert re.fullmatch(r"simulating: 2 of 4, elapsed 0:00:0\d, remaining about 0:00:0\d", lines[1])
     assert re.fullmatch(r"simulating: 5, elapsed 0:00:0\d", lines[3])
-    monkeypatch.setattr(shared, "PLAIN_EVERY_S", 10.0)
-    with shared.progress_bar("quick") as progress:
+    monkeypatch.setattr(progress_lines, "PLAIN_EVERY_S", 10.0)
+    with progress_lines.progress_bar("quick") as progress:
         progress(1, 2)
     assert capsys.readouterr().err == ""
 
 
+def test_the_time_that_remains_forgets_a_stop(monkeypatch, capsys):
+    seconds = iter([0.0, *(float(k) for k in range(1, 11)), *(60.0 + k for k in range(11, 51))])  # a minute, compiling
+    monkeypatch.setattr(progress_lines, "PLAIN_EVERY_S", 0.0)
+    monkeypatch.setattr(progress_lines.time, "monotonic", lambda: next(seconds))
+    with progress_lines.progress_bar("localizing") as progress:
+        for done in range(1, 51):
+            progress(done, 100)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[9].endswith("10 of 100, elapsed 0:00:10, remaining about 0:01:30")
+    assert lines[49].endswith("50 of 100, elapsed 0:01:50, remaining about 0:00:50")
+
+
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0:00:00"), (61, "0:01:01"), (3600 * 30 + 59.6, "30:01:00")])
 def test_durations(seconds, text):
-    assert shared.duration(seconds) == text
+    assert progress_lines.duration(seconds) == text
 
 
 def test_every_command_that_ends_in_figures_speaks_json(lumidock):

@@ -31,6 +31,7 @@ from lumidock.cli import (
     stations,
     water,
 )
+from lumidock.cli.progress import progress_bar
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
@@ -61,7 +62,6 @@ from lumidock.cli.shared import (
     interrupts_held,
     prepare_folder,
     prepare_sequence,
-    progress_bar,
     require_folder,
     seeds_of,
     shipped_or_path,

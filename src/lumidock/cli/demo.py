@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lumidock.camera import load_camera
+from lumidock.cli.progress import progress_bar
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
@@ -20,7 +21,6 @@ from lumidock.cli.shared import (
     interrupts_held,
     prepare_folder,
     prepare_sequence,
-    progress_bar,
     shipped_or_path,
     told_at_interrupt,
     warn_if_nothing_is_kept,

@@ -13,6 +13,7 @@ import numpy as np
 import typer
 
 from lumidock.camera import load_camera
+from lumidock.cli.progress import progress_bar
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     AsJson,
@@ -24,7 +25,6 @@ from lumidock.cli.shared import (
     app,
     example,
     prepare_folder,
-    progress_bar,
     seeds_of,
     shipped_or_path,
     warn_if_nothing_is_kept,
