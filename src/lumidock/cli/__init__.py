@@ -67,8 +67,8 @@ from lumidock.cli.shared import (
     shipped_or_path,
     simulated,
     tell,
+    tell_what_compiles,
     told_at_interrupt,
-    warn_if_nothing_is_kept,
 )
 from lumidock.errors import InputError, LumidockError
 from lumidock.methods import METHODS, require_method
@@ -216,7 +216,7 @@ def _run_one(source: str, out: Path, options: RunOptions, *, force: bool, as_jso
         source, force = str(simulated(source, out / "sequence", options.station, options.camera)), True
     recording = open_recording(source, options)
     tell(recording.notes)
-    warn_if_nothing_is_kept()
+    tell_what_compiles()
     localizer = recording.localizer()
     _require_another_folder(out, recording.source.path)
     prepare_folder(out, force)
@@ -249,7 +249,7 @@ def _run_many(
     jobs, outcomes = jobs_of(sources, out, options, force=force), dict[str, Outcome]()
     for job in jobs.values():
         _require_another_folder(job.out, Path(job.source))
-    warn_if_nothing_is_kept()
+    tell_what_compiles()
     out.mkdir(parents=True, exist_ok=True)
     left = f"{out} holds the runs that are finished; the same command continues with the others"
     with told_at_interrupt(left), progress_bar("run") as progress:
@@ -408,7 +408,7 @@ def _campaign(
     )
     prepare(campaign, out, force=force)
     left = f"{out} holds the finished shards; the same command continues with the others"
-    warn_if_nothing_is_kept()
+    tell_what_compiles()
     with told_at_interrupt(left), progress_bar("campaign") as progress:
         speed = run_campaign(campaign, out, workers=workers, cluster=cluster, progress=progress)
     table = tabulate(campaign, out)
@@ -423,8 +423,7 @@ def _campaign(
 @app.command("warm", epilog=example("lumidock warm"))
 def _warm() -> None:
     """Compile ahead, so that no run waits for it."""
-    from lumidock.app.warm import compile_ahead, compiled_code, warm_up
-    from lumidock.localizer import Localizer
+    from lumidock.app.warm import compile_all, compiled_code
 
     dock = load_station(shipped_or_path("station", DEFAULT_STATION))
     lens = load_camera(shipped_or_path("camera", DEFAULT_CAMERA))
@@ -432,7 +431,6 @@ def _warm() -> None:
     if state.mark == "bad":
         raise LumidockError(state.text)
     print("compiling detection and matching, one to two minutes ...", flush=True)
-    compile_ahead(dock, lens)
-    for name, _ in warm_up(Localizer(dock, lens).process, dock, lens):
+    for name in compile_all(dock, lens):
         print(f"ready for {name}", flush=True)
     print(compiled_code().text)

@@ -27,7 +27,7 @@ from lumidock.cli.shared import (
     prepare_folder,
     seeds_of,
     shipped_or_path,
-    warn_if_nothing_is_kept,
+    tell_what_compiles,
 )
 from lumidock.errors import InputError
 from lumidock.station import load_station
@@ -85,7 +85,7 @@ def _dock(
     dock = load_station(shipped_or_path("station", station) if station else station_of(loaded))
     lens = load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))
     docking = Docking(loaded, dock, lens, VEHICLES[vehicle], names[0], first, rendered)
-    warn_if_nothing_is_kept()
+    tell_what_compiles()
     prepare_folder(out, force)
     shown = [in_full(replace(docking, method=name)) for name in names]
     with progress_bar("dock") as progress:

@@ -41,6 +41,7 @@ _SIMULATED = (
     "truth.tum",
 )
 
+FIRST_RUN = "the first run of an installation compiles the numerical kernels before its first frame, one to two minutes"
 SCENARIOS = ", ".join(sorted(Path(entry.name).stem for entry in (files("lumidock") / "sim" / "scenarios").iterdir()))
 
 Out = Annotated[
@@ -115,13 +116,15 @@ def seeds_of(text: str) -> tuple[int, int]:
     return int(first), int(stop)
 
 
-def warn_if_nothing_is_kept() -> None:
-    """Say in one line that this run compiles anew, or not at all, and what to do about it."""
+def tell_what_compiles() -> None:
+    """Say in one line that this run compiles first, or anew, or not at all, and what to do about it."""
     from lumidock.app.warm import compiled_code
 
     state = compiled_code()
     if state.mark == "bad":
         print(f"warning: {state.text}", file=sys.stderr)
+    elif state.first:
+        print(f"{FIRST_RUN}; `lumidock warm` does it ahead", file=sys.stderr)
 
 
 def file_of(kind: str, given: str | None, beside: Path | None, source: Source) -> Path:
