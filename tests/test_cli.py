@@ -211,6 +211,21 @@ def test_an_evaluation_tells_what_the_claims_are_worth(lumidock, guesser, bare, 
     assert max(map(len, lines)) <= 120
 
 
+def test_an_evaluation_says_what_run_json_knows(lumidock, guesser, bare, tmp_path):
+    assert lumidock("run", bare, "--out", tmp_path / "run")[0] == len(guesser) - 1 == 0
+    path = tmp_path / "run" / "run.json"
+    described = json.loads(path.read_text())
+    described["counts"] |= {"finished": False, "over_limit": {"lateral": {"frames": 4, "least": 1.02, "most": 3.4}}}
+    path.write_text(json.dumps(described))
+    for words in ([], [bare]):
+        code, out, err = lumidock("eval", tmp_path / "run", *words)
+        assert (code, err) == (0, "")
+        assert "\nprotection: lateral level over its alert limit in 4 frames, 1.02 to 3.4 times\n" in out
+        assert "\nnot finished: the run was interrupted or goes on, and only its 7 frames so far count\n" in out
+    found = json.loads(lumidock("eval", tmp_path / "run", bare, "--json")[1])
+    assert (found["finished"], found["over_limit"]["lateral"]["frames"]) == (False, 4)
+
+
 def test_an_evaluation_of_the_papers_method_tells_of_no_claims(lumidock, bare, earlier):
     code, out, err = lumidock("eval", earlier, bare)
     assert (code, err) == (0, "")

@@ -25,7 +25,7 @@ from lumidock.streams.sources import open_source
 
 STATION, CAMERA = shipped_station(), shipped_camera()
 SMALL = Camera(320, 256, np.array([[273.0, 0, 159.5], [0, 273.0, 127.5], [0, 0, 1]]))
-FEW = ("path.frame_interval_s=4.0", "path.count=2", "path.hold=2")
+FEW, FEW_DRAWS = ("path.frame_interval_s=4.0",), ("path.count=2", "path.hold=2")
 NOTHING, NO_SPURIOUS = np.empty(0, np.int64), np.empty((0, 2))
 
 
@@ -42,7 +42,8 @@ def read(path):
 
 
 def written(out, name, *settings, seed=3, workers=1, camera=SMALL, video=False):
-    scenario = load_scenario(name, (*FEW, *settings))
+    draws = FEW_DRAWS if load_scenario(name).path.kind == "draws" else ()
+    scenario = load_scenario(name, (*FEW, *draws, *settings))
     write_rendered(scenario, STATION, camera, seed, out, workers=workers, video=video)
     return out
 

@@ -284,6 +284,7 @@ _WORTH_SAYING = 0.95  # factor on the exposure, above which a shorter one change
 def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:
     """The counts of a run, for people or as JSON; what contradicts the files in words, beside them."""
     from lumidock.app.run import contradictions_in_words
+    from lumidock.evaluation.run_description import over_limit_in_words
 
     tell(contradictions_in_words(counts))
     if as_json:
@@ -294,9 +295,8 @@ def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:
         f"{counts['frames']} frames: {counts['valid']} valid, {counts['guide_only']} guide only, {none} no fix; "
         f"written to {out}"
     )
-    for of, over in counts["over_limit"].items():
-        factors = f"{over['least']:.3g} to {over['most']:.3g} times the alert limit"
-        print(f"protection: the level of the {of} error in {over['frames']} frames, {factors}")
+    for line in over_limit_in_words({"counts": counts}):
+        print(f"protection: {line}")
     if counts["reason"]:
         print("not valid: " + ", ".join(f"{word} {count}" for word, count in sorted(counts["reason"].items())))
     asked = counts["exposure"]

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lumidock.errors import InputError
+from lumidock.evaluation import run_description
 from lumidock.evaluation.run_folders import find_runs
 from lumidock.report import figures, page, tables
 from lumidock.report.moments import annotated_images
@@ -103,4 +104,6 @@ def _title(views: Sequence[RunView]) -> str:
 def _lead(views: Sequence[RunView]) -> str:
     what = ", ".join(f"{view.name} ({view.described.get('method', '?')})" for view in views)
     truth = " With truth." if any(view.has_truth for view in views) else " There is no truth to compare it with."
-    return f"lumidock {views[0].described.get('lumidock', '?')}: {what}.{truth}"
+    cut = [view for view in views if run_description.finished(view.described) is False]
+    unfinished = "".join(f" {view.name} is not finished: {len(view.fixes)} frames so far." for view in cut)
+    return f"lumidock {views[0].described.get('lumidock', '?')}: {what}.{truth}{unfinished}"
