@@ -56,9 +56,7 @@ def _print(result: dict[str, Any]) -> None:
     layers = ", ".join(f"{layer} {count}" for layer, count in result["layers"].items())
     print(f"{result['name']}: {layers} lights")
     print("alert limits:\n  " + result["alert_limits"].replace("; ", "\n  "))
-    print(
-        "\nprotection levels to expect on a head-on approach to the docking point where all lights in view are detected;"
-    )
+    print("\nprotection levels to expect on a head-on approach to the docking point with all lights in view detected;")
     print("how far they are seen in your water is not considered here (`lumidock sim`):")
     print(f"{'z, m':>6}  {'stage':10}  {'lights in view':24}  lateral m  axial m  angle deg  bearing deg  range m")
     for row in result["corridor"]:

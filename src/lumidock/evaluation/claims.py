@@ -179,7 +179,7 @@ def nees_in_words(mean: float) -> list[str]:
     if mean > high:
         lines.append("far over 6 the covariances are too small: is something wrong in the station or the camera file?")
     elif mean < _POSE_FREEDOM:
-        assumed = "the settings `files` assume 2 cm of layer offset and 0.5 % of focal length"
+        assumed = "the settings files.layer_m and files.focal assume 2 cm and 0.5 %"
         lines.append(f"below 6: smaller errors than stated; {assumed}")
     return lines
 

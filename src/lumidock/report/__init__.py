@@ -82,7 +82,8 @@ def _legend(view: RunView) -> str:
     layers = [f"{layer} {words[k % len(words)]}" for k, layer in enumerate(view.station.layers_front_to_rear())]
     return (
         f"A ring is a detection with the id of the light that it was identified as ({', '.join(layers)}); a cross is "
-        "where the pose puts a light. A red ring with a number was not used, for the reason given below the image."
+        "where the pose puts a light. Red rings were not used, for the reasons below the image; those that are close to "
+        "each other share a number."
     )
 
 

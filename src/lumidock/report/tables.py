@@ -74,17 +74,12 @@ def reasons(view: RunView) -> Table | None:
         return None
     guided = Counter(fix.reason for fix in view.fixes if fix.reason and fix.guide is not None)
     rows = [
-        [word, str(count), str(guided[word]), _meaning(view, word), _longest(view, word)]
+        [word, str(count), str(guided[word]), _WHY.get(word, "-"), _longest(view, word)]
         for word, count in counts.most_common()
     ]
     head = ["reason", "frames", "with bearing and range", "what it means", "longest stretch"]
-    return Table("Why there was no valid pose.", head, rows)
-
-
-def _meaning(view: RunView, word: str) -> str:
-    """What a reason means; of `protection` also which levels are over their limits, and by how much."""
-    more = run_description.over_limit_in_words(view.described) if word == "protection" else []
-    return "; ".join([_WHY.get(word, "-"), *more])
+    over = run_description.over_limit_in_words(view.described)
+    return Table(" ".join(["Why there was no valid pose.", *(f"Protection: {line}." for line in over)]), head, rows)
 
 
 def contradictions(view: RunView) -> Table | None:
@@ -103,7 +98,7 @@ def _longest(view: RunView, word: str) -> str:
         if current > best:
             best, start = current, first
     t = view.t_s[start]
-    return f"{best} frames" + (f" from {t:.2f} s" if np.isfinite(t) else "")
+    return f"{best} frame{'s' * (best > 1)}" + (f" from {t:.2f} s" if np.isfinite(t) else "")
 
 
 def handover(view: RunView) -> Table | None:
