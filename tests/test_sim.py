@@ -147,7 +147,7 @@ def test_truth_of_detections_is_the_projection_from_the_true_pose(name):
 
 @pytest.mark.parametrize("name", shipped_scenarios())
 def test_same_seed_same_frames(name):
-    settings = ("path.count=20",)
+    settings = ("path.count=20",) if load_scenario(name).path.kind == "draws" else ()
     one, two, other = (frames_of(name, *settings, seed=seed) for seed in (3, 3, 4))
     assert all(np.array_equal(a.detections.uv, b.detections.uv) for a, b in zip(one, two, strict=True))
     assert all(np.array_equal(a.T_dock_cam, b.T_dock_cam) for a, b in zip(one, two, strict=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -245,7 +246,9 @@ def load_scenario(name: str, settings: tuple[str, ...] = ()) -> Scenario:
     elif Path(name).suffix in (".yaml", ".yml"):
         content = read_mapping(Path(name), "scenario")
     else:
-        raise InputError(f"{name}: no such scenario; there are {', '.join(shipped_scenarios())}, or give a .yaml file")
+        near = difflib.get_close_matches(name, shipped_scenarios(), n=1)
+        meant = f", did you mean {near[0]}? There" if near else "; there"
+        raise InputError(f"{name}: no such scenario{meant} are {', '.join(shipped_scenarios())}, or give a .yaml file")
     for setting in settings:
         _apply(content, setting)
     return validate(Scenario, content, name)
