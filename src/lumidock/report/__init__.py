@@ -82,7 +82,7 @@ def _legend(view: RunView) -> str:
     layers = [f"{layer} {words[k % len(words)]}" for k, layer in enumerate(view.station.layers_front_to_rear())]
     return (
         f"A ring is a detection with the id of the light that it was identified as ({', '.join(layers)}); a cross is "
-        "where the pose puts a light. Red rings were not used, for the reasons below the image; those close to each other "
+        "where the pose puts a light. Red rings were not used, for the reasons below the image; rings near each other "
         "share a number."
     )
 
