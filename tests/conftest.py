@@ -114,7 +114,9 @@ def lumidock(monkeypatch, capfd):
         monkeypatch.setattr(progress, "PLAIN_EVERY_S", math.inf)  # a slow machine prints progress
         with pytest.raises(SystemExit) as exited:
             cli.main()
-        return exited.value.code, *capfd.readouterr()
+        out, err = capfd.readouterr()
+        lines = err.splitlines(keepends=True)  # without what depends on whether this checkout is compiled
+        return exited.value.code, out, "".join(line for line in lines if "the numerical kernels" not in line)
 
     return call
 
