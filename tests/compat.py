@@ -2,7 +2,7 @@
 
 Each Python gets the newest versions that pyproject.toml allows; the lowest Python also gets the lowest. Each
 environment is read-only, belongs to somebody else, and has no HOME.
-Arguments choose some: `python tests/compat.py 3.13 lowest`.
+Arguments choose some: `python tests/compat.py 3.13 3.10-lowest`.
 """
 
 import csv
@@ -30,7 +30,7 @@ def main():
     wanted = set(sys.argv[1:])
     pythons = {version: python for version in PYTHONS if (python := python_of(version))}
     kinds = [(version, "newest") for version in pythons] + [(min(pythons, key=PYTHONS.index), LOWEST)]
-    chosen = [kind for kind in kinds if not wanted or wanted & set(kind)]
+    chosen = [kind for kind in kinds if not wanted or wanted & {*kind, "-".join(kind)}]
     print(f"Python {', '.join(pythons)} at hand", flush=True)
     failed = 0
     with tempfile.TemporaryDirectory(prefix="lumidock-compat-") as name:

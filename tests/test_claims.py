@@ -3,9 +3,11 @@ import pytest
 from conftest import assert_close, transforms
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from lumidock.alert_limits import DEFAULT_ALERT_LIMITS
+from lumidock.config import FilesConfig
 from lumidock.evaluation.claims import (
     GuideClaims,
     PoseClaims,
@@ -13,6 +15,7 @@ from lumidock.evaluation.claims import (
     continuity,
     hazardous,
     nees,
+    nees_in_words,
     over_level,
     pose_error,
     stanford,
@@ -99,6 +102,16 @@ def test_what_is_no_covariance_is_counted_apart(P):
     assert_close(found, [1.0, np.nan, np.nan])
     counted = consistency(poses)
     assert counted == {"frames": 1, "mean": 1.0, "improper": 1, "by_stage": {"front": {"frames": 1, "mean": 1.0}}}
+
+
+def test_words_on_nees_give_the_range_of_one_docking():
+    low, high = stats.chi2.ppf([0.025, 0.975], 6)
+    assert f"{low:.1f} to {high:.1f} in 19 of 20" in nees_in_words(7.0)[0]
+    assert [len(nees_in_words(mean)) for mean in (0.5 * low, 5.9, 6.1, 0.99 * high, 1.01 * high)] == [2, 2, 1, 1, 2]
+    config = FilesConfig()
+    assert f"{100 * config.layer_m:g} cm" in nees_in_words(3.0)[1]
+    assert f"{100 * config.focal:g} %" in nees_in_words(3.0)[1]
+    assert "too small" in nees_in_words(20.0)[1]
 
 
 def test_the_nees_has_a_mean_for_each_stage():

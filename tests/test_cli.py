@@ -12,7 +12,7 @@ from test_sources import write_video
 
 from lumidock import cli, methods
 from lumidock.camera import save_camera
-from lumidock.cli import shared
+from lumidock.cli import progress as progress_lines
 from lumidock.datatypes import Fix, Guide, Protection
 from lumidock.sim.scenario import shipped_scenarios
 
@@ -48,8 +48,8 @@ def test_the_version_is_printed_and_nothing_else_done(lumidock):
 
 
 def test_progress_without_a_terminal_is_plain_lines(monkeypatch, capsys):
-    monkeypatch.setattr(shared, "PLAIN_EVERY_S", 0.0)
-    with shared.progress_bar("simulating") as progress:
+    monkeypatch.setattr(progress_lines, "PLAIN_EVERY_S", 0.0)
+    with progress_lines.progress_bar("simulating") as progress:
         for done in (1, 2, 4):
             progress(done, 4)
         progress(5, None)
@@ -57,15 +57,27 @@ def test_progress_without_a_terminal_is_plain_lines(monkeypatch, capsys):
     assert re.fullmatch(r"simulating: 1 of 4, elapsed 0:00:0\d", lines[0])
     assert re.fullmatch(r"simulating: 2 of 4, elapsed 0:00:0\d, remaining about 0:00:0\d", lines[1])
     assert re.fullmatch(r"simulating: 5, elapsed 0:00:0\d", lines[3])
-    monkeypatch.setattr(shared, "PLAIN_EVERY_S", 10.0)
-    with shared.progress_bar("quick") as progress:
+    monkeypatch.setattr(progress_lines, "PLAIN_EVERY_S", 10.0)
+    with progress_lines.progress_bar("quick") as progress:
         progress(1, 2)
     assert capsys.readouterr().err == ""
 
 
+def test_the_time_that_remains_forgets_a_stop(monkeypatch, capsys):
+    seconds = iter([0.0, *(float(k) for k in range(1, 11)), *(60.0 + k for k in range(11, 51))])  # a minute, compiling
+    monkeypatch.setattr(progress_lines, "PLAIN_EVERY_S", 0.0)
+    monkeypatch.setattr(progress_lines.time, "monotonic", lambda: next(seconds))
+    with progress_lines.progress_bar("localizing") as progress:
+        for done in range(1, 51):
+            progress(done, 100)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[9].endswith("10 of 100, elapsed 0:00:10, remaining about 0:01:30")
+    assert lines[49].endswith("50 of 100, elapsed 0:01:50, remaining about 0:00:50")
+
+
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0:00:00"), (61, "0:01:01"), (3600 * 30 + 59.6, "30:01:00")])
 def test_durations(seconds, text):
-    assert shared.duration(seconds) == text
+    assert progress_lines.duration(seconds) == text
 
 
 def test_every_command_that_ends_in_figures_speaks_json(lumidock):
@@ -197,6 +209,21 @@ def test_an_evaluation_tells_what_the_claims_are_worth(lumidock, guesser, bare, 
     assert any(re.match(r"error over the protection level: lateral \d of 3, .*, range \d of 3", line) for line in lines)
     assert any(re.match(r"NEES [\d.]+ over 3 frames \(front [\d.]+\)$", line) for line in lines)
     assert max(map(len, lines)) <= 120
+
+
+def test_an_evaluation_says_what_run_json_knows(lumidock, guesser, bare, tmp_path):
+    assert lumidock("run", bare, "--out", tmp_path / "run")[0] == len(guesser) - 1 == 0
+    path = tmp_path / "run" / "run.json"
+    described = json.loads(path.read_text())
+    described["counts"] |= {"finished": False, "over_limit": {"lateral": {"frames": 4, "least": 1.02, "most": 3.4}}}
+    path.write_text(json.dumps(described))
+    for words in ([], [bare]):
+        code, out, err = lumidock("eval", tmp_path / "run", *words)
+        assert (code, err) == (0, "")
+        assert "\nprotection: lateral level over its alert limit in 4 frames, 1.02 to 3.4 times\n" in out
+        assert "\nnot finished: the run was interrupted or goes on, and only its 7 frames so far count\n" in out
+    found = json.loads(lumidock("eval", tmp_path / "run", bare, "--json")[1])
+    assert (found["finished"], found["over_limit"]["lateral"]["frames"]) == (False, 4)
 
 
 def test_an_evaluation_of_the_papers_method_tells_of_no_claims(lumidock, bare, earlier):

@@ -181,6 +181,7 @@ def test_the_source_is_not_written_into(refusal, sequence):
     ("words", "match"),
     [
         (["nowhere"], "no such scenario; there are any-roll, approach"),
+        (["aproach"], "no such scenario, did you mean approach? There are any-roll, approach"),
         (["nowhere.yaml"], "nowhere.yaml: No such file"),
         (["trials", "--set", "path"], "wanted key=value"),
         (["trials", "--set", "=1"], "wanted key=value"),

@@ -25,7 +25,7 @@ from lumidock.streams.sources import open_source
 
 STATION, CAMERA = shipped_station(), shipped_camera()
 SMALL = Camera(320, 256, np.array([[273.0, 0, 159.5], [0, 273.0, 127.5], [0, 0, 1]]))
-FEW = ("path.frame_interval_s=4.0", "path.count=2", "path.hold=2")
+FEW, FEW_DRAWS = ("path.frame_interval_s=4.0",), ("path.count=2", "path.hold=2")
 NOTHING, NO_SPURIOUS = np.empty(0, np.int64), np.empty((0, 2))
 
 
@@ -41,8 +41,12 @@ def read(path):
         return list(csv.DictReader(file))
 
 
+def is_drawn(name):
+    return load_scenario(name).path.kind == "draws"
+
+
 def written(out, name, *settings, seed=3, workers=1, camera=SMALL, video=False):
-    scenario = load_scenario(name, (*FEW, *settings))
+    scenario = load_scenario(name, (*FEW, *(FEW_DRAWS if is_drawn(name) else ()), *settings))
     write_rendered(scenario, STATION, camera, seed, out, workers=workers, video=video)
     return out
 
@@ -56,7 +60,7 @@ def electrons(name, z, *settings, seed=0):
 
 @pytest.mark.parametrize("name", [name for name in shipped_scenarios() if name != "any-roll"])
 def test_every_shipped_scenario_can_be_rendered(name, tmp_path):
-    out = written(tmp_path, name, "path.hold=1")
+    out = written(tmp_path, name, *(("path.hold=1",) if is_drawn(name) else ()))
     rows = read(out / "timestamps.csv")
     assert len(rows) >= 2
     poses = {row["frame"] for row in read(out / "truth.csv")}

@@ -1,4 +1,5 @@
 import json
+import math
 
 import cv2
 import numpy as np
@@ -41,6 +42,22 @@ def test_the_shipped_cage_passes_and_its_levels_are_those_of_the_lights():
     assert rows[3]["lateral_m"] < rows[10]["lateral_m"] < rows[30]["lateral_m"]
     four = next(row for row in result["confusions"] if (row["layer"], row["seen"]) == ("front", 4))
     assert_close(four["assignment_px"], four["assignment_m"] * 2087.0 / 18.0, atol=0.1)
+
+
+def test_a_small_single_ring_guides_long_before_it_gives_a_pose(lumidock, tmp_path):
+    p = [[0.30, 0.28, 0], [-0.03, 0.39, 0], [-0.35, 0.0, 0], [-0.24, -0.32, 0], [0.30, -0.29, 0]]
+    station = dock(tmp_path / "a.yaml", p)
+    rows = inspect_station(station, LENS, Config(), REQUIRED)["corridor"]
+    guided, valid = ({row["z_m"] for row in rows if row[word]} for word in ("guide", "valid"))
+    assert max(guided) > 10.0 > max(valid)
+    own = station.alert_limits.guide
+    for row in rows:
+        if row["guide"] and not row["valid"]:  # by limits of its own
+            assert row["bearing_deg"] < math.degrees(own.bearing_rad)
+            assert row["range_m"] < max(own.range_m, own.range_share * row["z_m"])
+        assert (row["bearing_deg"] is None) == (row["z_m"] - (row["range_m"] or 0.0) < own.from_m)
+    _, out, _ = lumidock("station", "check", tmp_path / "a.yaml")
+    assert f"guidance (bearing and range) is to be expected from z = {max(guided):g} m on" in out
 
 
 def test_a_square_of_lights_fails_for_its_mirror_image(tmp_path):

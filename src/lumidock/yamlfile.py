@@ -127,11 +127,26 @@ def validate(model: type[Model], content: dict[str, Any], origin: str) -> Model:
         return model.model_validate(content)
     except ValidationError as error:
         first = _most_telling(error.errors())
-        place = " ".join(".".join(str(part) for part in first["loc"] if not str(part).startswith("_")).split())
+        place = " ".join(_place_in(content, first["loc"]).split())
         message = first["msg"].removeprefix("Value error, ")
         if first["type"] == "extra_forbidden":
             message = f"unknown key{_known_keys(model, first['loc'])}"
         raise InputError(f"{origin}: {place + ': ' if place else ''}{message}") from None
+
+
+def _place_in(content: Any, loc: tuple[int | str, ...]) -> str:  # noqa: ANN401  # whatever a YAML file holds
+    """A place in words of the file: keys with points between them, an entry of a list by its `id` or counted from 1."""
+    words = ""
+    for part in loc:
+        if isinstance(part, int) and isinstance(content, list):
+            content = content[part] if part < len(content) else None
+            name = " ".join(str(content.get("id", "")).split()) if isinstance(content, dict) else ""
+            words += f" {name}: " if name else f" entry {part + 1}: "
+        elif isinstance(content, dict) and not str(part).startswith("_"):
+            content = content.get(part)
+            words += f".{part}" if words and not words.endswith(" ") else str(part)
+        # else the name of a model or a type, where a key may hold one of several
+    return words.rstrip(": ")
 
 
 def _most_telling(errors: list[ErrorDetails]) -> ErrorDetails:

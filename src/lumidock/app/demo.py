@@ -15,6 +15,8 @@ from typing_extensions import Self
 
 from lumidock.camera import Camera
 from lumidock.datatypes import Fix, Frame, Image, Stage
+from lumidock.evaluation.claims import nees_in_words
+from lumidock.evaluation.run_description import over_limit_in_words
 from lumidock.picture import developed
 from lumidock.station import Station
 from lumidock.streams.overlay import around_lights, draw, whole
@@ -89,7 +91,7 @@ class Album:
 
 
 def summary_lines(result: dict[str, Any], counts: dict[str, Any]) -> list[str]:
-    """Six lines about a run against its truth."""
+    """A line for each topic about a run against its truth."""
     frames, hazards, gap = result["frames"], result["hazardous"], result["longest_gap_s"]
     wrong = result.get("identities", {"wrong": 0, "identified": 0})
     latency = counts["latency_us"].get("p50", np.nan) / 1000.0
@@ -97,6 +99,7 @@ def summary_lines(result: dict[str, Any], counts: dict[str, Any]) -> list[str]:
         f"valid       {result['valid']} of {frames} frames have a full pose"
         + (f", longest gap {gap:.2f} s" * bool(gap)),
         f"guide       {result.get('guide', 0)} of {frames} frames have bearing and range",
+        *(f"protection  {line}" for line in over_limit_in_words({"counts": counts})),
         f"hazardous   {hazards['valid']['any']} poses and {hazards['guide']['any']} guides are off by more than their "
         "alert limit",
     ]
@@ -107,7 +110,6 @@ def summary_lines(result: dict[str, Any], counts: dict[str, Any]) -> list[str]:
             f"identities  {wrong['wrong']} of {wrong['identified']} identified detections are another light",
         ]
     if result["nees"]["frames"]:
-        lines.append(
-            f"NEES        {result['nees']['mean']:.1f}; 6 on average if stated covariances are right, less if too wide"
-        )
+        mean = result["nees"]["mean"]
+        lines.append("\n            ".join([f"NEES        {mean:.1f}", *nees_in_words(mean)]))
     return [*lines, f"time        {latency:.0f} ms a frame (median, without decoding)"]

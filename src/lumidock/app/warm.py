@@ -35,10 +35,14 @@ _OTHERS = (
 
 @dataclass(frozen=True, slots=True)
 class CompiledCode:
-    """Whether the next run finds its kernels compiled: ok, not yet, or never; and a sentence that says so."""
+    """Whether the next run finds its kernels compiled: ok, not yet, or never; and a sentence that says so.
+
+    `first`: not one is compiled, so that the next run is the first of this installation.
+    """
 
     mark: Literal["ok", "note", "bad"]
     text: str
+    first: bool = False
 
 
 def compiled_code() -> CompiledCode:
@@ -51,7 +55,7 @@ def compiled_code() -> CompiledCode:
         return CompiledCode("bad", f"{text} first fix; set NUMBA_CACHE_DIR to a folder that can be written")
     if done < needed:
         text = f"{done} of {needed} kernels are compiled in {compiling.FOLDER}; the next run compiles the rest,"
-        return CompiledCode("note", f"{text} up to two minutes, unless `lumidock warm` has done so")
+        return CompiledCode("note", f"{text} up to two minutes, unless `lumidock warm` has done so", first=not done)
     return CompiledCode("ok", f"all {needed} kernels are compiled in {compiling.FOLDER}; no run waits for them")
 
 
@@ -70,6 +74,13 @@ def compile_ahead(station: Station, camera: Camera) -> None:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     for part in parts:
         part.join()
+
+
+def compile_all(station: Station, camera: Camera) -> Iterator[str]:
+    """Compile everything that a run needs; yields each pixel format that is ready."""
+    compile_ahead(station, camera)
+    for name, _ in warm_up(Localizer(station, camera).process, station, camera):
+        yield name
 
 
 def _run(part: Callable[[Station, Camera], None], station: Station, camera: Camera) -> None:

@@ -31,6 +31,7 @@ from lumidock.cli import (
     stations,
     water,
 )
+from lumidock.cli.progress import progress_bar
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
@@ -61,14 +62,13 @@ from lumidock.cli.shared import (
     interrupts_held,
     prepare_folder,
     prepare_sequence,
-    progress_bar,
     require_folder,
     seeds_of,
     shipped_or_path,
     simulated,
     tell,
+    tell_what_compiles,
     told_at_interrupt,
-    warn_if_nothing_is_kept,
 )
 from lumidock.errors import InputError, LumidockError
 from lumidock.methods import METHODS, require_method
@@ -216,7 +216,7 @@ def _run_one(source: str, out: Path, options: RunOptions, *, force: bool, as_jso
         source, force = str(simulated(source, out / "sequence", options.station, options.camera)), True
     recording = open_recording(source, options)
     tell(recording.notes)
-    warn_if_nothing_is_kept()
+    tell_what_compiles()
     localizer = recording.localizer()
     _require_another_folder(out, recording.source.path)
     prepare_folder(out, force)
@@ -249,7 +249,7 @@ def _run_many(
     jobs, outcomes = jobs_of(sources, out, options, force=force), dict[str, Outcome]()
     for job in jobs.values():
         _require_another_folder(job.out, Path(job.source))
-    warn_if_nothing_is_kept()
+    tell_what_compiles()
     out.mkdir(parents=True, exist_ok=True)
     left = f"{out} holds the runs that are finished; the same command continues with the others"
     with told_at_interrupt(left), progress_bar("run") as progress:
@@ -284,6 +284,7 @@ _WORTH_SAYING = 0.95  # factor on the exposure, above which a shorter one change
 def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:
     """The counts of a run, for people or as JSON; what contradicts the files in words, beside them."""
     from lumidock.app.run import contradictions_in_words
+    from lumidock.evaluation.run_description import over_limit_in_words
 
     tell(contradictions_in_words(counts))
     if as_json:
@@ -294,9 +295,8 @@ def _print_counts(counts: dict[str, Any], out: Path, as_json: bool) -> None:
         f"{counts['frames']} frames: {counts['valid']} valid, {counts['guide_only']} guide only, {none} no fix; "
         f"written to {out}"
     )
-    for of, over in counts["over_limit"].items():
-        factors = f"{over['least']:.3g} to {over['most']:.3g} times the alert limit"
-        print(f"protection: the level of the {of} error in {over['frames']} frames, {factors}")
+    for line in over_limit_in_words({"counts": counts}):
+        print(f"protection: {line}")
     if counts["reason"]:
         print("not valid: " + ", ".join(f"{word} {count}" for word, count in sorted(counts["reason"].items())))
     asked = counts["exposure"]
@@ -408,7 +408,7 @@ def _campaign(
     )
     prepare(campaign, out, force=force)
     left = f"{out} holds the finished shards; the same command continues with the others"
-    warn_if_nothing_is_kept()
+    tell_what_compiles()
     with told_at_interrupt(left), progress_bar("campaign") as progress:
         speed = run_campaign(campaign, out, workers=workers, cluster=cluster, progress=progress)
     table = tabulate(campaign, out)
@@ -423,8 +423,7 @@ def _campaign(
 @app.command("warm", epilog=example("lumidock warm"))
 def _warm() -> None:
     """Compile ahead, so that no run waits for it."""
-    from lumidock.app.warm import compile_ahead, compiled_code, warm_up
-    from lumidock.localizer import Localizer
+    from lumidock.app.warm import compile_all, compiled_code
 
     dock = load_station(shipped_or_path("station", DEFAULT_STATION))
     lens = load_camera(shipped_or_path("camera", DEFAULT_CAMERA))
@@ -432,7 +431,6 @@ def _warm() -> None:
     if state.mark == "bad":
         raise LumidockError(state.text)
     print("compiling detection and matching, one to two minutes ...", flush=True)
-    compile_ahead(dock, lens)
-    for name, _ in warm_up(Localizer(dock, lens).process, dock, lens):
+    for name in compile_all(dock, lens):
         print(f"ready for {name}", flush=True)
     print(compiled_code().text)

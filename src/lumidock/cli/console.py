@@ -36,7 +36,7 @@ from lumidock.cli.shared import (
     open_any,
     simulated,
     tell,
-    warn_if_nothing_is_kept,
+    tell_what_compiles,
 )
 from lumidock.config import Config, load_config
 from lumidock.errors import InputError, extra
@@ -251,7 +251,7 @@ def _serve_recording(stack: ExitStack, recording: Recording, scratch: Path, at: 
 
     scene, localizer = recording.scene, None
     if recording.run is None:
-        warn_if_nothing_is_kept()
+        tell_what_compiles()
         localizer = localizer_of(recording.method, scene.station, scene.camera, recording.config)
     files = Files(recording.station, recording.camera, scratch)
     console = Console(files, recording.method, recording.config, f"dock {scene.station.name}")

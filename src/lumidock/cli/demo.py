@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
+from collections import deque
 from pathlib import Path
 from typing import Any
 
 from lumidock.camera import load_camera
+from lumidock.cli.progress import progress_bar
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
@@ -20,10 +23,9 @@ from lumidock.cli.shared import (
     interrupts_held,
     prepare_folder,
     prepare_sequence,
-    progress_bar,
     shipped_or_path,
+    tell_what_compiles,
     told_at_interrupt,
-    warn_if_nothing_is_kept,
 )
 from lumidock.config import Config
 from lumidock.datatypes import Fix
@@ -44,8 +46,8 @@ def _demo(
     from lumidock.evaluation.metrics import evaluate
 
     prepare_folder(out, force)
-    warn_if_nothing_is_kept()
     with told_at_interrupt(f"{out} holds what was written so far; `lumidock demo --out {out} --force` begins again"):
+        _compile()
         _simulate(out / "sequence", seed)
         counts, shown = _run(out)
         result = evaluate(out / "run", out / "sequence")
@@ -63,6 +65,22 @@ def _demo(
 def install_hint(extra: str) -> str:
     """How to add an extra, to an installed package and to a checkout."""
     return f"pip install 'lumidock[{extra}]', or in a checkout pip install -e '.[{extra}]'"
+
+
+def _compile() -> None:
+    """Compile what is not compiled yet, so that the progress of what follows tells how long it takes."""
+    from lumidock.app.warm import compile_all, compiled_code
+
+    if compiled_code().mark != "note":
+        tell_what_compiles()
+        return
+    print(
+        "compiling the numerical kernels, once for each installation: one to two minutes", file=sys.stderr, flush=True
+    )
+    dock, lens = (
+        shipped_or_path(kind, name) for kind, name in (("station", DEFAULT_STATION), ("camera", DEFAULT_CAMERA))
+    )
+    deque(compile_all(load_station(dock), load_camera(lens)), maxlen=0)
 
 
 def _simulate(sequence: Path, seed: int) -> None:
@@ -104,6 +122,7 @@ def _run(out: Path) -> tuple[dict[str, Any], list[Path]]:
             progress(len(album.fixes), source.count)
             let_interrupt()
 
+        progress(0, source.count)
         copy(station_file, run_folder / "station.yaml")
         copy(camera_file, run_folder / "camera.yaml")
         setup = Setup("lumidock", False, Config(), station_file, camera_file)

@@ -11,6 +11,7 @@ import numpy as np
 import typer
 
 from lumidock.camera import load_camera
+from lumidock.cli.progress import progress_bar
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
@@ -18,7 +19,6 @@ from lumidock.cli.shared import (
     CameraOption,
     Force,
     example,
-    progress_bar,
     require_new,
     shipped_or_path,
 )

@@ -13,6 +13,7 @@ import numpy as np
 import typer
 
 from lumidock.camera import load_camera
+from lumidock.cli.progress import progress_bar
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     AsJson,
@@ -24,10 +25,9 @@ from lumidock.cli.shared import (
     app,
     example,
     prepare_folder,
-    progress_bar,
     seeds_of,
     shipped_or_path,
-    warn_if_nothing_is_kept,
+    tell_what_compiles,
 )
 from lumidock.errors import InputError
 from lumidock.station import load_station
@@ -85,7 +85,7 @@ def _dock(
     dock = load_station(shipped_or_path("station", station) if station else station_of(loaded))
     lens = load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))
     docking = Docking(loaded, dock, lens, VEHICLES[vehicle], names[0], first, rendered)
-    warn_if_nothing_is_kept()
+    tell_what_compiles()
     prepare_folder(out, force)
     shown = [in_full(replace(docking, method=name)) for name in names]
     with progress_bar("dock") as progress:

@@ -9,6 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from lumidock.cli.shared import AsJson, Force, app, example, require_new
+from lumidock.evaluation.claims import nees_in_words
+from lumidock.evaluation.run_description import over_limit_in_words
 
 
 @app.command(
@@ -69,6 +71,10 @@ def print_evaluation(result: dict[str, Any]) -> None:
         f"valid {result['valid']} of {_share(result, 'valid')}, guide {result['guide']} of {_share(result, 'guide')}; "
         f"not valid: {_words(result['reasons'])}"
     )
+    for line in over_limit_in_words({"counts": result}):
+        print(f"protection: {line}")
+    if result["finished"] is False:
+        print(f"not finished: the run was interrupted or goes on, and only its {result['frames']} frames so far count")
     for word, gaps in result["continuity"].items():
         if gaps["longest_gap_s"] is not None:
             print(f"longest gap in {word} {gaps['longest_gap_s']:.2f} s; gaps over 0.45 s: {gaps['long_gaps']}")
@@ -117,11 +123,11 @@ def _print_integrity(result: dict[str, Any]) -> None:
     if nees["frames"]:
         stages = {stage: f"{mean['mean']:.2f}" for stage, mean in nees["by_stage"].items()}
         print(f"NEES {nees['mean']:.2f} over {nees['frames']} frames ({_words(stages)})")
-        print("  6 on average where covariances are right; more: too small; less: too wide, as where survey and")
-        print("  calibration are better than the station file states")
+        for line in nees_in_words(nees["mean"]):
+            print(f"  {line}")
     if nis := result["nis"]:
         print(f"NIS per degree of freedom {nis['mean']:.2f} over {nis['frames']} frames")
-        print("  1 on average where the noise of the centroids is as stated")
+        print("  1 on average where the noise of the centroids is as stated; less: they are better than that")
     if nees["improper"]:
         print(f"covariances that are not positive definite: {nees['improper']}")
 

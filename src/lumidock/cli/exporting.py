@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from lumidock.cli.progress import progress_bar
 from lumidock.cli.shared import (
     AsJson,
     Force,
@@ -17,7 +18,6 @@ from lumidock.cli.shared import (
     app,
     example,
     interrupts_held,
-    progress_bar,
     require_new,
     told_at_interrupt,
 )

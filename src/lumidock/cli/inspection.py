@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lumidock.cli.progress import progress_bar
 from lumidock.cli.shared import (
     AsJson,
     AsStored,
@@ -23,7 +24,6 @@ from lumidock.cli.shared import (
     calibration_of,
     example,
     open_any,
-    progress_bar,
 )
 from lumidock.errors import extra
 from lumidock.streams.source import Reading

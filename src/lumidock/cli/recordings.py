@@ -119,6 +119,7 @@ def run_recording(
         copy(recording.station_file, out / "station.yaml")
         camera_file = keep_camera(recording.calibration, out / "camera.yaml")
         setup = recording.setup(camera_file)
+        progress(0, recording.source.count)
 
         def on_fix(_item: Item, _fix: Fix) -> None:
             nonlocal done

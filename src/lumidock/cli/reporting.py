@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from lumidock.cli.progress import progress_bar
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
@@ -19,7 +20,6 @@ from lumidock.cli.shared import (
     Workers,
     app,
     example,
-    progress_bar,
     require_new,
     shipped_or_path,
     told_at_interrupt,

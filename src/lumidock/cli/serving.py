@@ -46,7 +46,7 @@ from lumidock.cli.shared import (
     require_new,
     simulated,
     tell,
-    warn_if_nothing_is_kept,
+    tell_what_compiles,
 )
 from lumidock.errors import InputError, extra
 from lumidock.go_no_go import DRIFT_M_S, Passage, Watch
@@ -209,7 +209,7 @@ def _opened(stack: ExitStack, source: str, options: RunOptions, network: Network
 
 def _ready_localizer(setting: Setting, recording: Recording) -> methods.Method:
     """A localizer whose kernels are compiled."""
-    warn_if_nothing_is_kept()
+    tell_what_compiles()
     dock, lens, name = setting.station, setting.camera, recording.options.method
     list(warm_up(localizer_of(name, dock, lens, recording.config).process, dock, lens))
     return localizer_of(name, dock, lens, recording.config)

@@ -13,6 +13,7 @@ import typer
 from typer.core import TyperCommand
 
 from lumidock.camera import Camera, load_camera
+from lumidock.cli.progress import progress_bar
 from lumidock.cli.shared import (
     AsJson,
     CameraOption,
@@ -23,7 +24,6 @@ from lumidock.cli.shared import (
     calibration_of,
     example,
     open_any,
-    progress_bar,
     require_new,
     shipped_or_path,
 )

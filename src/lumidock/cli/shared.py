@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -15,17 +14,9 @@ from types import FrameType
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from lumidock.camera import Camera, load_camera, save_camera
+from lumidock.cli.progress import progress_bar
 from lumidock.errors import InputError
 from lumidock.station import load_station
 from lumidock.streams.live import open_live
@@ -39,8 +30,6 @@ _MAX_SEED = 10**9
 _MAX_DELAY_MS = 10_000.0  # no camera on a vehicle is later
 SIM = "sim:"
 DEFAULT_STATION, DEFAULT_CAMERA = "cage-2x2x5", "imx264-60deg"
-_TELLING = 0.02  # share of the items after which the rate tells the time that remains: the first ones may compile code
-PLAIN_EVERY_S = 10.0  # between two lines of progress where there is no terminal
 _SIMULATED = (
     "frames",
     "video.mp4",
@@ -52,6 +41,7 @@ _SIMULATED = (
     "truth.tum",
 )
 
+FIRST_RUN = "the first run of an installation compiles the numerical kernels before its first frame, one to two minutes"
 SCENARIOS = ", ".join(sorted(Path(entry.name).stem for entry in (files("lumidock") / "sim" / "scenarios").iterdir()))
 
 Out = Annotated[
@@ -126,13 +116,15 @@ def seeds_of(text: str) -> tuple[int, int]:
     return int(first), int(stop)
 
 
-def warn_if_nothing_is_kept() -> None:
-    """Say in one line that this run compiles anew, or not at all, and what to do about it."""
+def tell_what_compiles() -> None:
+    """Say in one line that this run compiles first, or anew, or not at all, and what to do about it."""
     from lumidock.app.warm import compiled_code
 
     state = compiled_code()
     if state.mark == "bad":
         print(f"warning: {state.text}", file=sys.stderr)
+    elif state.first:
+        print(f"{FIRST_RUN}; `lumidock warm` does it ahead", file=sys.stderr)
 
 
 def file_of(kind: str, given: str | None, beside: Path | None, source: Source) -> Path:
@@ -323,61 +315,6 @@ def told_at_interrupt(left: str) -> Iterator[None]:
     except KeyboardInterrupt:
         print(f"lumidock: interrupted; {left}", file=sys.stderr)
         raise
-
-
-Report = Callable[[int, int | None], None]
-
-
-@contextmanager
-def progress_bar(title: str) -> Iterator[Report]:
-    """Progress on standard error: a bar on a terminal, elsewhere a line every ten seconds.
-
-    Yields a callback (done, total).
-    """
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield _PlainProgress(title).report
-        return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("elapsed"),
-        TimeElapsedColumn(),
-        TextColumn("remaining"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task(title, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-class _PlainProgress:
-    """Lines for a log or a pipe, the first after ten seconds: what is over sooner needs none."""
-
-    def __init__(self, title: str) -> None:
-        self._title, self._start_s = title, time.monotonic()
-        self._next_s = self._start_s + PLAIN_EVERY_S
-        self._first: tuple[float, int] | None = None  # the rate counts from the first item on, which may compile code
-
-    def report(self, done: int, total: int | None) -> None:
-        """Print a line if the last one was long enough ago."""
-        now = time.monotonic()
-        self._first = self._first or (now, done)
-        if now < self._next_s:
-            return
-        self._next_s = now + PLAIN_EVERY_S
-        line = f"{self._title}: {done}{f' of {total}' if total else ''}, elapsed {duration(now - self._start_s)}"
-        first_s, first_done = self._first
-        if total and done - first_done > _TELLING * total:
-            line += f", remaining about {duration((now - first_s) * (total - done) / (done - first_done))}"
-        print(line, file=sys.stderr, flush=True)
-
-
-def duration(seconds: float) -> str:
-    """Hours, minutes and seconds as h:mm:ss."""
-    whole = round(seconds)
-    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
 def example(*lines: str) -> str:

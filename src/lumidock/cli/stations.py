@@ -11,6 +11,7 @@ import typer
 from lumidock.camera import load_camera
 from lumidock.cli.shared import DEFAULT_CAMERA, AsJson, CameraOption, app, example, shipped_or_path
 from lumidock.config import Config
+from lumidock.evaluation.station_check import LEVELS, Requirements, inspect_station
 from lumidock.station import load_station
 
 station = typer.Typer(help="Check a dock's lights.", no_args_is_help=True, rich_markup_mode=None)
@@ -36,7 +37,6 @@ def _check(
     as_json: AsJson = False,
 ) -> None:
     """Check what is in view, confused and measured; exit code 1 on failure."""
-    from lumidock.evaluation.station_check import Requirements, inspect_station
     from lumidock.report.station_picture import draw_station
 
     dock = load_station(shipped_or_path("station", source))
@@ -56,8 +56,9 @@ def _print(result: dict[str, Any]) -> None:
     layers = ", ".join(f"{layer} {count}" for layer, count in result["layers"].items())
     print(f"{result['name']}: {layers} lights")
     print("alert limits:\n  " + result["alert_limits"].replace("; ", "\n  "))
-    print("\nhead-on approach to the docking point; the expected protection levels are the best that the lights allow:")
-    print(f"{'z, m':>6}  {'stage':10}  {'lights in view':24}  lateral m  axial m  angle deg")
+    print("\nprotection levels to expect on a head-on approach to the docking point with all lights in view detected;")
+    print("how far they are seen in your water is not considered here (`lumidock sim`):")
+    print(f"{'z, m':>6}  {'stage':10}  {'lights in view':24}  lateral m  axial m  angle deg  bearing deg  range m")
     for row in result["corridor"]:
         print(_corridor_line(row))
     print(
@@ -76,11 +77,13 @@ def _print(result: dict[str, Any]) -> None:
 
 
 def _expected(corridor: list[dict[str, Any]]) -> str:
-    """From where on the way a valid pose may be had."""
-    valid = [row["z_m"] for row in corridor if row["valid"]]
-    if not valid:
-        return "no valid pose is to be expected on the way, guidance at most"
-    return f"a valid pose is to be expected from z = {max(valid):g} m on, in {len(valid)} of {len(corridor)} rows"
+    """From where on the way a valid pose, and guidance, may be had."""
+    lines = []
+    for word, what in (("valid", "a valid pose is"), ("guide", "guidance (bearing and range) is")):
+        at = [row["z_m"] for row in corridor if row[word]]
+        where = f"from z = {max(at):g} m on, in {len(at)} of {len(corridor)} rows" if at else "nowhere on the way"
+        lines.append(f"{what} to be expected {where}")
+    return "\n".join(lines)
 
 
 def _print_self_fits(result: dict[str, Any]) -> None:
@@ -102,10 +105,18 @@ def _corridor_line(row: dict[str, Any]) -> str:
     if not any(row["lights"].values()):
         return f"{row['z_m']:6g}  {row['stage']:10}  no light in view"
     lights = ", ".join(f"{layer} {count}" for layer, count in row["lights"].items())
-    numbers = [row[name] for name in ("lateral_m", "axial_m", "angle_deg")]
-    levels = "  ".join("        -" if number is None else f"{number:9.3f}" for number in numbers)
-    verdict = "valid" if row["valid"] else "no pose" if numbers[0] is None else "over the alert limits"
-    return f"{row['z_m']:6g}  {row['stage']:10}  {lights:24}  {levels}  {verdict}"
+    numbers = [row[name] for name in LEVELS]
+    widths = (9, 7, 9, 11, 7)
+    levels = "  ".join(f"{'-':>{w}}" if n is None else f"{n:{w}.3f}" for n, w in zip(numbers, widths, strict=True))
+    return f"{row['z_m']:6g}  {row['stage']:10}  {lights:24}  {levels}  {_verdict(row)}"
+
+
+def _verdict(row: dict[str, Any]) -> str:
+    """What is to be expected at one distance."""
+    if row["lateral_m"] is None:
+        return "no pose"
+    words = [word for word in ("valid", "guide") if row[word]]
+    return " and ".join(words) or "over the alert limits"
 
 
 def _misfit(metres: float | None, pixels: float | None) -> str:

@@ -12,7 +12,8 @@ import typer
 
 from lumidock.camera import load_camera, save_camera
 from lumidock.cli.calibration import calib
-from lumidock.cli.shared import AsJson, Force, Fps, example, open_any, progress_bar, require_new, shipped_or_path
+from lumidock.cli.progress import progress_bar
+from lumidock.cli.shared import AsJson, Force, Fps, example, open_any, require_new, shipped_or_path
 from lumidock.config import Config
 from lumidock.datatypes import Frame
 from lumidock.errors import InputError

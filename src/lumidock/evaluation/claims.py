@@ -18,6 +18,8 @@ from lumidock.geometry import bearing_and_range, so3_log
 
 POSE_ERRORS, GUIDE_ERRORS = ("lateral", "axial", "angle"), ("bearing", "range")
 LONG_GAP_NS = 450_000_000  # three frames of the approach
+_POSE_FREEDOM = 6  # degrees of freedom of a pose
+_ONE_DOCKING = (1.2, 14.4)  # the chi-squared distribution of these lies between them with 95 %
 _MIN_EIGENVALUE = 1e-12  # of a correlation matrix; less is rounding of the file
 
 
@@ -167,6 +169,19 @@ def consistency(poses: PoseClaims) -> dict[str, Any]:
         "improper": improper,
         "by_stage": {name: mean for name, mean in by_stage.items() if mean["frames"]},
     }
+
+
+def nees_in_words(mean: float) -> list[str]:
+    """What the mean NEES of the poses of one docking says: the value to expect, and what another one means."""
+    low, high = _ONE_DOCKING
+    shared = "whose frames share one survey and calibration"
+    lines = [f"expected: 6, and of one docking, {shared}, {low:g} to {high:g} in 19 of 20"]
+    if mean > high:
+        lines.append("far over 6 the covariances are too small: is something wrong in the station or the camera file?")
+    elif mean < _POSE_FREEDOM:
+        assumed = "the settings files.layer_m and files.focal assume 2 cm and 0.5 %"
+        lines.append(f"below 6: smaller errors than stated; {assumed}")
+    return lines
 
 
 def continuity(t_ns: Sequence[int]) -> dict[str, Any]:

@@ -31,7 +31,7 @@ _MARGIN = 1.3  # protection levels this many times those of the bound must be in
 
 
 class Bound:
-    """Follows one run along its true path; each `step` gives the smallest protection levels (3,) that are possible."""
+    """Follows one run along its true path; each `step` gives the smallest protection levels (5,) that are possible."""
 
     def __init__(self, station: Station, camera: Camera, config: Config, *, cold: bool = False) -> None:
         self.station, self.camera, self.config, self.cold = station, camera, config, cold
@@ -49,7 +49,10 @@ class Bound:
         self._known = np.zeros(self._model.n_layers, bool)
 
     def step(self, t_ns: int, T_dock_cam: Array, lights: Indices) -> Array | None:
-        """Lateral m, axial m and angle rad of protection at `t_ns` on the true pose with `lights` (K,) detected."""
+        """Levels (5,) at `t_ns` on the true pose with `lights` (K,) detected; None where there can be no pose.
+
+        Lateral m, axial m, angle rad, bearing rad and range m.
+        """
         if self.cold or (self._P is not None and t_ns - self._lights_ns > self.config.track.max_gap_s * 1e9):
             self.forget()
         T_cam_dock = se3_inverse(T_dock_cam)
@@ -78,7 +81,7 @@ class Bound:
             factors,
             np.empty((9, 9)),
         )
-        return np.array(levels[:3])
+        return np.array(levels)
 
     def _at(self, R: Array, t: Array) -> FilterState:
         """The filter on the true pose `R`, `t` of T_cam_dock; its covariance is shared, and changes in place."""
@@ -90,7 +93,7 @@ class Bound:
         pl = self.step(t_ns, T_dock_cam, lights)
         if pl is None:
             return False
-        lateral, axial, angle = (_MARGIN * pl).tolist()
+        lateral, axial, angle = (_MARGIN * pl[:3]).tolist()
         lateral_m, axial_m, angle_rad = self.station.alert_limits.of_pose(float(T_dock_cam[2, 3]), axial)
         return lateral < lateral_m and axial < axial_m and angle < angle_rad and math.isfinite(lateral)
 

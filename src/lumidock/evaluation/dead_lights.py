@@ -70,9 +70,9 @@ def level_ratios(station: Station, camera: Camera, config: Config, approach: App
         )
         if z > approach.from_z_m + 1e-9:
             out[k] = 0.0
-        elif level is not None and np.isfinite(level).all():
+        elif level is not None and np.isfinite(level[:3]).all():
             limits = np.array(station.alert_limits.of_pose(float(z), float(level[1])))
-            out[k] = min(float(np.max(level / limits)), NO_LEVEL) if (limits > 0.0).all() else NO_LEVEL
+            out[k] = min(float(np.max(level[:3] / limits)), NO_LEVEL) if (limits > 0.0).all() else NO_LEVEL
     return out
 
 

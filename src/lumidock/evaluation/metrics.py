@@ -19,7 +19,7 @@ from lumidock.datatypes import Array
 from lumidock.errors import InputError
 from lumidock.evaluation import claims
 from lumidock.evaluation.claims import GuideClaims, PoseClaims
-from lumidock.evaluation.run_description import description_if_any, mean_nis, source_kind, with_passes
+from lumidock.evaluation.run_description import description_if_any, finished, mean_nis, source_kind, with_passes
 from lumidock.geometry import pose_from_quat, se3_inverse, transform_points
 from lumidock.station import Station, load_station
 from lumidock.streams.run_folder import COVARIANCE_COLUMNS, GUIDE_COLUMNS, PROTECTION_COLUMNS
@@ -87,6 +87,8 @@ def _counted(path: Path, fixes: list[Row], description: Mapping[str, Any]) -> di
     }
     result["availability"] = _shares(result)
     result["nis"] = mean_nis(description)
+    result["over_limit"] = description.get("counts", {}).get("over_limit")
+    result["finished"] = finished(description)
     return result
 
 

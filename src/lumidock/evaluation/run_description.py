@@ -71,3 +71,22 @@ def contradictions(description: Mapping[str, Any]) -> list[tuple[str, str, int]]
         return [(str(one["text"]), str(one["file"]), int(one["frames"])) for one in found]
     except (KeyError, TypeError, ValueError):
         return []
+
+
+def finished(description: Mapping[str, Any]) -> bool | None:
+    """Whether the run came to its end; False where it was interrupted or goes on, None where that is not known."""
+    found = description.get("counts", {}).get("finished")
+    return found if isinstance(found, bool) else None
+
+
+def over_limit_in_words(description: Mapping[str, Any]) -> list[str]:
+    """For each kind of error whose protection level kept frames from being valid: how many, and by which factor."""
+    try:
+        found = description["counts"]["over_limit"]
+        return [
+            f"{of} level over its alert limit in {int(one['frames'])} frames, "
+            f"{float(one['least']):.3g} to {float(one['most']):.3g} times"
+            for of, one in found.items()
+        ]
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return []

@@ -82,7 +82,7 @@ def evaluate_all(folder: Path, truth: Path | None = None) -> list[dict[str, Any]
         latency = {"latency_us": description.get("counts", {}).get("latency_us", {})}
         known = truth or _truth_beside(run, description)
         if known is None and run == folder:
-            raise InputError(f"{run}: no truth in or beside it; give TRUTH")
+            raise InputError(f"{run}: no truth in or beside it; give TRUTH, or use `lumidock report`, which needs none")
         rows.append(about | (count_run(run) if known is None else evaluate(run, known)) | latency)
     return rows
 

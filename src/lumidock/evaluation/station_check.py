@@ -24,6 +24,8 @@ _MAX_ASSIGNMENTS = 2_000_000  # that are tried for one row of confusions
 _LEAST_IDENTIFIED = 4  # lights of a layer that identify each other in one frame
 _NEARLY = 5.0  # times the misfit that is required, within which the array nearly fits itself
 _MOST_FITS = 4  # of a kind that are listed
+_DEG = 180.0 / math.pi
+LEVELS = ("lateral_m", "axial_m", "angle_deg", "bearing_deg", "range_m")  # protection levels of a row of the corridor
 _STAGE_LIGHTS = 3  # of a layer in view, from which a pose can rest on it
 
 
@@ -118,19 +120,21 @@ def _corridor(station: Station, camera: Camera, config: Config) -> list[dict[str
 
 
 def _row(station: Station, z_m: float, seen: Indices, level: Array | None) -> dict[str, Any]:
-    """One row of the corridor; without a light in view a pose would only be predicted, so none is stated."""
+    """One row of the corridor; without a light in view a pose would only be predicted, so none is stated.
+
+    Near the dock, where guidance has no limits of its own, its levels are None.
+    """
     counts = {layer: int(np.isin(station.lights_of(layer), seen).sum()) for layer in station.layers_front_to_rear()}
     row: dict[str, Any] = {"z_m": z_m, "lights": counts, "stage": _stage(counts)}
     if level is None or not np.isfinite(level).all() or not len(seen):
-        return row | {"lateral_m": None, "axial_m": None, "angle_deg": None, "valid": False}
-    lateral, axial, angle = (float(value) for value in level)
-    lateral_m, axial_m, angle_rad = station.alert_limits.of_pose(z_m, axial)
-    return row | {
-        "lateral_m": lateral,
-        "axial_m": axial,
-        "angle_deg": math.degrees(angle),
-        "valid": lateral < lateral_m and axial < axial_m and angle < angle_rad,
-    }
+        return row | dict.fromkeys(LEVELS) | {"valid": False, "guide": False}
+    limits, near_end_m = station.alert_limits, abs(z_m) - float(level[4])
+    row |= dict(zip(LEVELS, (level * [1.0, 1.0, _DEG, _DEG, 1.0]).tolist(), strict=True))
+    valid = bool((level[:3] < limits.of_pose(z_m, float(level[1]))).all())
+    ahead_rad = 0.0 if z_m > 0.0 else math.pi  # past the entrance its origin is behind the camera
+    if not limits.applies_to_guide(ahead_rad, near_end_m):
+        return row | dict.fromkeys(LEVELS[3:]) | {"valid": valid, "guide": valid}
+    return row | {"valid": valid, "guide": bool((level[3:] < limits.of_guide(near_end_m)).all())}
 
 
 def _stage(counts: dict[str, int]) -> str:

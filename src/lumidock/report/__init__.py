@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lumidock.errors import InputError
+from lumidock.evaluation import run_description
 from lumidock.evaluation.run_folders import find_runs
 from lumidock.report import figures, page, tables
 from lumidock.report.moments import annotated_images
@@ -81,7 +82,8 @@ def _legend(view: RunView) -> str:
     layers = [f"{layer} {words[k % len(words)]}" for k, layer in enumerate(view.station.layers_front_to_rear())]
     return (
         f"A ring is a detection with the id of the light that it was identified as ({', '.join(layers)}); a cross is "
-        "where the pose puts a light. A red ring with a number was not used, for the reason given below the image."
+        "where the pose puts a light. Red rings were not used, for the reasons below the image; rings near each other "
+        "share a number."
     )
 
 
@@ -103,4 +105,6 @@ def _title(views: Sequence[RunView]) -> str:
 def _lead(views: Sequence[RunView]) -> str:
     what = ", ".join(f"{view.name} ({view.described.get('method', '?')})" for view in views)
     truth = " With truth." if any(view.has_truth for view in views) else " There is no truth to compare it with."
-    return f"lumidock {views[0].described.get('lumidock', '?')}: {what}.{truth}"
+    cut = [view for view in views if run_description.finished(view.described) is False]
+    unfinished = "".join(f" {view.name} is not finished: {len(view.fixes)} frames so far." for view in cut)
+    return f"lumidock {views[0].described.get('lumidock', '?')}: {what}.{truth}{unfinished}"

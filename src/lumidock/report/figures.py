@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _MOST_POINTS = 700  # of a series; of longer runs every k-th frame is drawn, and all that is over its level
 _ELLIPSES = 14
+_SHORT_SPAN, _SOME_SPAN = 4.0, 50.0  # of a logarithmic axis: below them ticks are even, and stand at 1, 2 and 5 as well
 _SHOWN = {"lateral": ("lateral, m", 1.0), "axial": ("axial, m", 1.0), "angle": ("angle, deg", 180.0 / np.pi)}
 _LAYER_COLORS = ("front", "rear", "transition", "accent")  # variables of the page, in the order of streams.colors
 _RUN_COLORS = ("rear", "front", "transition", "accent", "bad", "search")
@@ -169,6 +170,7 @@ def _draw_levels(figure: Figure, narrow: bool, view: RunView) -> None:
         _draw_level_and_limit(axes, view, keep, (view.levels[:, k] * scale, view.limits[:, k] * scale))
         _scatter_stages(axes, view, keep, view.t_s, np.maximum(view.errors[:, k] * scale, 1e-4), legend=k == 0)
         axes.set_ylabel(label)
+        _label_plainly(axes)
     _label_stages(panels[0], narrow)
     panels[-1].set_xlabel("time, s")
 
@@ -179,6 +181,22 @@ def _draw_level_and_limit(axes: Axes, view: RunView, keep: np.ndarray, level_and
     axes.plot(view.t_s[keep], limit[keep], color=COLORS["bad"], lw=1.2, ls=":")
     if np.isfinite(level).any() or np.isfinite(limit).any():
         axes.set_yscale("log")
+
+
+def _label_plainly(axes: Axes) -> None:
+    """Numbers as people write them on a logarithmic axis of y, and as many as its span has room for."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+
+    if axes.get_yscale() != "log":
+        return
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_formatter(lambda value, _at: f"{value:g}")
+    axes.yaxis.set_minor_formatter(lambda value, _at: f"{value:g}" if high < _SOME_SPAN * low else "")
+    if high < _SHORT_SPAN * low:  # too short for powers of ten
+        axes.yaxis.set_major_locator(MaxNLocator(4))
+        axes.yaxis.set_minor_locator(NullLocator())
+    elif high < _SOME_SPAN * low:
+        axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
 
 
 def guide(view: RunView, prefix: str) -> Plot:
@@ -202,6 +220,7 @@ def _draw_guide(figure: Figure, view: RunView) -> None:
         _draw_level_and_limit(axes, view, far, (view.guide_levels[:, k] * scale, limit * scale))
         _scatter_stages(axes, view, far, view.t_s, np.maximum(view.guide_errors[:, k] * scale, 1e-4))
         axes.set_ylabel(label)
+        _label_plainly(axes)
     panels[-1].set_xlabel("time, s")
 
 

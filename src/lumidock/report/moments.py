@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -30,13 +30,20 @@ _WIDTH, _QUALITY = 760, 82  # px; of JPEG
 _NEAR_PX = 40.0  # a detection so near to a projected light is described by its distance from it
 _UNLIKELY = 0.5  # probability of being a lamp below which that is the reason for not using a detection
 _MOST_NOTES = 6
+_LABEL_PX = 30.0  # of the picture: nearer to each other than this two labels would overlap
 
 
 def annotated_images(view: RunView, most: int) -> list[AnnotatedImage]:
-    """At most `most` images, the most telling first; none where the source has no frames at hand."""
+    """At most `most` images: the most telling one, then others as they came in time, an even number of them.
+
+    None where the source has no frames at hand.
+    """
     if view.source is None or view.source.kind == "detections" or not most:
         return []
-    return images_of(view, _moments(view)[:most])
+    first, *others = _moments(view)[:most]
+    if len(others) > 1:
+        others = others[: len(others) // 2 * 2]  # they stand in two columns
+    return images_of(view, [first, *sorted(others)])
 
 
 def images_of(view: RunView, chosen: list[tuple[int, str]]) -> list[AnnotatedImage]:
@@ -76,7 +83,10 @@ def _candidates(view: RunView) -> Iterator[tuple[int | None, str]]:
     valid, guided = view.valid, view.guided
     stage = np.array([fix.stage for fix in view.fixes])
     usable = valid | guided
-    yield _middle(np.flatnonzero(valid & (stage == "front"))), "Approach on the front layer"
+    for name, layers in (("front", "the front layer"), ("transition", "both layers")):
+        if (valid & (stage == name)).any():
+            yield _middle(np.flatnonzero(valid & (stage == name))), f"Approach on {layers}"
+            break
     yield _first(valid), "First valid pose"
     yield (
         _middle(np.flatnonzero(~usable & (np.cumsum(usable) > 0) & (np.cumsum(usable[::-1])[::-1] > 0))),
@@ -118,7 +128,7 @@ def _annotated(view: RunView, fix: Fix, image: Image, title: str) -> AnnotatedIm
     assert done
     height, width = small.shape[:2]
     projected = _projected(view, fix)
-    unused = _reasons(fix, view.station, projected)
+    unused = _numbered(_reasons(fix, view.station, projected), fix, crop)
     marks = [*_crosses(view.station, projected, crop), *_rings(fix, view.station, crop, unused)]
     inside = [m for m in marks if -20 < m.x < width + 20 and -20 < m.y < height + 20]
     shown = "whole image" if crop.width == image.shape[1] else f"{crop.width} of {image.shape[1]} px across"
@@ -130,21 +140,24 @@ def _annotated(view: RunView, fix: Fix, image: Image, title: str) -> AnnotatedIm
         width=width,
         height=height,
         marks=inside,
-        notes=_notes(fix, list(unused.values())),
+        notes=_notes(fix, unused),
     )
 
 
-def _notes(fix: Fix, why: list[str]) -> list[str]:
+def _notes(fix: Fix, unused: Sequence[_Unused]) -> list[str]:
     """A line for each reason, with the numbers of the rings that it holds for; and how many have no ring."""
-    numbers: dict[str, list[str]] = {}
-    for number, reason in enumerate(why, start=1):
-        numbers.setdefault(reason, []).append(str(number))
-    notes = [f"{', '.join(of)}: {reason}" for reason, of in numbers.items()]
+    numbers: dict[str, list[int]] = {}
+    for one in unused:
+        for why in one.why:
+            numbers.setdefault(why, []).append(one.number)
+    notes = [f"{', '.join(map(str, dict.fromkeys(of)))}: {why}" for why, of in numbers.items()]
     more = len(notes) - _MOST_NOTES
-    notes = notes if more <= 0 else [*notes[:_MOST_NOTES], f"and {more} more reasons"]
+    if more > 0:
+        notes = [*notes[:_MOST_NOTES], f"and {more} more reason{'s' * (more > 1)}"]
     hidden = 0 if fix.match is None else len(fix.match.light) - len(shown_detections(fix.match))
     if hidden:
-        notes.append(f"{hidden} more detections, each a lamp with a probability below {LEAST_P_LIGHT:g}, have no ring")
+        more_text = "1 more detection, a lamp" if hidden == 1 else f"{hidden} more detections, each a lamp"
+        notes.append(f"{more_text} with a probability below {LEAST_P_LIGHT:g}, without a ring")
     return notes
 
 
@@ -162,17 +175,46 @@ def _crosses(station: Station, projected: Array, crop: Crop) -> Iterator[Mark]:
             yield Mark(x, y, 0.0, "", of_layer(station, light))
 
 
-def _rings(fix: Fix, station: Station, crop: Crop, unused: dict[int, str]) -> Iterator[Mark]:
+def _rings(fix: Fix, station: Station, crop: Crop, unused: Sequence[_Unused]) -> Iterator[Mark]:
     if fix.match is None:
         return
-    number = {detection: str(n) for n, detection in enumerate(unused, start=1)}
-    detections = fix.match.detections
-    for k in shown_detections(fix.match).tolist():
-        light = int(fix.match.light[k])
-        x, y = map(float, crop.at(detections.uv[k]))
+    number = {one.detections[0]: str(one.number) for one in unused}
+    detections, light, shown = fix.match.detections, fix.match.light, shown_detections(fix.match).tolist()
+    at = np.array([crop.at(uv) for uv in detections.uv], float).reshape(-1, 2)
+    identified = at[[k for k in shown if light[k] >= 0]]
+    for k in sorted(shown, key=lambda k: k in number):  # rings with a number last, so that no other hides it
+        x, y = map(float, at[k])
         ring = round(ring_px(float(detections.radius_px[k]), crop), 1)
-        label, color = (station.ids[light], of_layer(station, light)) if light >= 0 else (number[k], SPURIOUS_ON_WATER)
-        yield Mark(x, y, ring, label, color)
+        if light[k] >= 0:
+            yield Mark(x, y, ring, station.ids[light[k]], of_layer(station, int(light[k])))
+        else:  # the id of a light beside it stands on the right
+            crowded = bool((np.linalg.norm(identified - at[k], axis=1) < _LABEL_PX).any())
+            yield Mark(x, y, ring, number.get(k, ""), SPURIOUS_ON_WATER, on_left=crowded)
+
+
+@dataclass(frozen=True, slots=True)
+class _Unused:
+    """Detections that were not used and that one label serves, since their rings overlap; and why each was not."""
+
+    number: int
+    detections: tuple[int, ...]
+    why: tuple[str, ...]
+
+
+def _numbered(reasons: dict[int, str], fix: Fix, crop: Crop) -> list[_Unused]:
+    """The unused detections, those whose labels would overlap under one number."""
+    groups: list[list[int]] = []
+    if fix.match is None:
+        return []
+    at = {k: np.asarray(crop.at(fix.match.detections.uv[k])) for k in reasons}
+    for k in reasons:
+        near = (group for group in groups if np.linalg.norm(at[k] - at[group[0]]) < _LABEL_PX)
+        group = next(near, None)
+        if group is None:
+            groups.append([k])
+        else:
+            group.append(k)
+    return [_Unused(n, tuple(of), tuple(reasons[k] for k in of)) for n, of in enumerate(groups, start=1)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,7 +241,7 @@ def _reasons(fix: Fix, station: Station, projected: Array) -> dict[int, str]:
 
 def _why(uv: Array, p_light: float, fix: Fix, others: _Identified) -> str:
     if p_light < _UNLIKELY:
-        return f"probably no lamp (probability {p_light:.2f})"
+        return f"probably no lamp (probability below {_UNLIKELY:g})"
     if fix.T_dock_cam is None:
         return "fits none of the identified lights" if others.ids else "no light could be identified in this frame"
     away = np.linalg.norm(others.projected - uv, axis=1)

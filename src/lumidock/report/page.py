@@ -36,13 +36,17 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Something drawn over an image, at `x`, `y` px of it: a ring of radius `r`, or a cross when `r` is 0."""
+    """Something drawn over an image, at `x`, `y` px of it: a ring of radius `r`, or a cross when `r` is 0.
+
+    The label of a ring stands on its right, or `on_left`.
+    """
 
     x: float
     y: float
     r: float
     label: str
     color: str
+    on_left: bool = False
 
 
 @dataclass(frozen=True, slots=True)

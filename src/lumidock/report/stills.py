@@ -47,8 +47,8 @@ def plot_trajectory(fixes: Sequence[Fix], truth: dict[str, Array], station: Stat
     error.set_ylabel("position error, m")
     error.set_xlabel("z, m: distance before the entrance plane; shaded: inside the dock")
     error.set_xlim(float(true[:, 2].max()) + 1.0, float(station.p_dock[:, 2].min()) - 1.0)
-    top.set_title("Camera in the dock frame: from above, from the side, and how far from the truth", loc="left")
-    top.legend(loc="upper right", ncols=3, fontsize=8)
+    top.set_title("Camera in the dock frame: from above, from the side; and its error", loc="left")
+    top.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=6, fontsize=8, frameon=False, borderaxespad=0.2)
     for axes in (top, side, error):
         axes.axvspan(0.0, float(station.p_dock[:, 2].min()), color=ON_PAPER[1], alpha=0.07)
         axes.grid(alpha=0.25)

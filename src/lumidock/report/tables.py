@@ -14,6 +14,7 @@ import yaml
 
 from lumidock.config import Config
 from lumidock.evaluation import run_description
+from lumidock.evaluation.claims import nees_in_words
 from lumidock.report.page import Listing, Table, Tile
 from lumidock.report.view import STAGES, RunView
 
@@ -35,13 +36,6 @@ _WHY = {
     "bad_frame": "the image could not be read or does not fit the calibration",
     "bad_stamp": "the time stamp is missing or is not later than the one before",
 }
-
-
-# the squared error of the pose divided by its covariance, which has 6 degrees of freedom
-NEES_MEANS = (
-    "6 on average where the covariances are right; more means that they are too small, less that they are too wide, as "
-    "where survey and calibration are better than the station file states"
-)
 
 
 def tiles(view: RunView) -> list[Tile]:
@@ -84,7 +78,8 @@ def reasons(view: RunView) -> Table | None:
         for word, count in counts.most_common()
     ]
     head = ["reason", "frames", "with bearing and range", "what it means", "longest stretch"]
-    return Table("Why there was no valid pose.", head, rows)
+    over = run_description.over_limit_in_words(view.described)
+    return Table(" ".join(["Why there was no valid pose.", *(f"Protection: {line}." for line in over)]), head, rows)
 
 
 def contradictions(view: RunView) -> Table | None:
@@ -103,7 +98,7 @@ def _longest(view: RunView, word: str) -> str:
         if current > best:
             best, start = current, first
     t = view.t_s[start]
-    return f"{best} frames" + (f" from {t:.2f} s" if np.isfinite(t) else "")
+    return f"{best} frame{'s' * (best > 1)}" + (f" from {t:.2f} s" if np.isfinite(t) else "")
 
 
 def handover(view: RunView) -> Table | None:
@@ -149,9 +144,8 @@ def integrity(view: RunView) -> Table | None:
         if row["frames"]
     ]
     if e["nees"]["frames"]:
-        rows.append(
-            ["NEES of the covariance", f"{e['nees']['mean']:.2f} over {e['nees']['frames']} frames; {NEES_MEANS}"]
-        )
+        mean, frames = e["nees"]["mean"], e["nees"]["frames"]
+        rows.append(["NEES of the covariance", "; ".join([f"{mean:.2f} over {frames} frames", *nees_in_words(mean)])])
     for word, gaps in e["continuity"].items():
         if gaps["longest_gap_s"] is not None:
             rows.append([f"longest gap in {word}", f"{gaps['longest_gap_s']:.2f} s; over 0.45 s: {gaps['long_gaps']}"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -45,6 +46,9 @@ _DEFAULT_STATION = "cage-2x2x5"
 _BETWEEN_DRAWS_S = 60.0  # more than the time after which every track is dropped
 
 
+_OF_DRAWS = ("count", "hold", "hold_deg_s", "z_m", "turn_deg", "tilt_deg")  # knobs of a path of kind draws alone
+
+
 class Path3D(KnobSection):
     """The camera's path.
 
@@ -74,6 +78,14 @@ class Path3D(KnobSection):
     z_m: Lengths = (3.0, 19.0)  # of the draws
     turn_deg: Angles = (3.0, 3.0, 3.0)  # largest pitch, yaw, roll of the draws, each uniform
     tilt_deg: Angle | None = None  # replaces pitch and yaw: largest tilt, in any direction
+
+    @model_validator(mode="after")
+    def _draws_alone_are_counted(self) -> Self:
+        given = "" if self.kind == "draws" else next((name for name in _OF_DRAWS if name in self.model_fields_set), "")
+        if given:
+            how = "its frames follow from its length, speed_m_s and frame_interval_s"
+            raise ValueError(f"{given}: belongs to a path of kind draws, and this one is of kind {self.kind}; {how}")
+        return self
 
     @model_validator(mode="after")
     def _path_has_frames(self) -> Self:
@@ -234,7 +246,9 @@ def load_scenario(name: str, settings: tuple[str, ...] = ()) -> Scenario:
     elif Path(name).suffix in (".yaml", ".yml"):
         content = read_mapping(Path(name), "scenario")
     else:
-        raise InputError(f"{name}: no such scenario; there are {', '.join(shipped_scenarios())}, or give a .yaml file")
+        near = difflib.get_close_matches(name, shipped_scenarios(), n=1)
+        meant = f", did you mean {near[0]}? There" if near else "; there"
+        raise InputError(f"{name}: no such scenario{meant} are {', '.join(shipped_scenarios())}, or give a .yaml file")
     for setting in settings:
         _apply(content, setting)
     return validate(Scenario, content, name)

@@ -187,7 +187,9 @@ def _example(path: Path, files: list[Path]) -> str:
 
 
 def _hint(path: Path) -> str:
-    """The folders below that have pictures, as the end of a line that says that this one has none."""
+    """What the folder is instead, or which below it have pictures, as the end of a line that says that it has none."""
+    if (path / "fixes.csv").exists():
+        return "; it is the result of a run, which `lumidock report`, `eval` and `console` show"
     below = sorted(
         inner.name for inner in path.iterdir() if inner.is_dir() and any(_is_picture(file) for file in inner.iterdir())
     )
