@@ -58,10 +58,10 @@ def envelope(simulation: Simulation, config: Config) -> dict[str, Any]:
     _, station, camera = simulation.load()
     localizers = {method: localizer_of(method, station, camera, config) for method in METHODS}
     seen: dict[str, list[tuple[float, bool, bool]]] = {method: [] for method in METHODS}
-    for z, frame in rendered_frames(simulation):
+    for T_dock_cam, frame in rendered_frames(simulation):
         for method, localizer in localizers.items():
             fix = localizer.process(frame)
-            seen[method].append((z, fix.valid, fix.guide is not None))
+            seen[method].append((float(T_dock_cam[2, 3]), fix.valid, fix.guide is not None))
     return {method: _used(rows) for method, rows in seen.items()}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from lumidock.report.page import PageSection, Table, Tile, markdown
+from lumidock.report.page import PageSection, Table, Tile
 from lumidock.reproduce.intervals import WORSE, mark, share
 from lumidock.reproduce.paper_figures import (
     AXIS_M,
@@ -47,11 +47,6 @@ _TEXT = (
     "Of shares both 95 % intervals are compared; the paper's is of the 2076 to 2153 frames that it counts. Other "
     "figures of the paper are of one run, and are met (✓) or not (✗)."
 )
-
-
-def summary_table(results: Results) -> str:
-    """The table as Markdown, without a caption."""
-    return markdown(_table(_rows(results))).partition("\n\n")[2].strip()
 
 
 def _table(rows: list[tuple[str, str, list[Cell]]]) -> Table:

@@ -12,13 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from lumidock.alert_limits import DEFAULT_ALERT_LIMITS
 from lumidock.app.run import Setup, run
 from lumidock.camera import Camera, load_camera
 from lumidock.config import Config
-from lumidock.datatypes import Array, Fix, Frame, Unusable
+from lumidock.datatypes import Array, Detections, Fix, Frame, Indices, Unusable
 from lumidock.errors import FrameError
 from lumidock.evaluation.campaign import plan, run_shard
 from lumidock.evaluation.campaign_table import row_of
+from lumidock.evaluation.claims import pose_error
 from lumidock.evaluation.counts import Tally
 from lumidock.evaluation.metrics import evaluate, true_poses
 from lumidock.methods import Method, localizer_of
@@ -35,6 +37,7 @@ from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.source import Source
 
 _FOUR = 4  # identified lights of a layer that give a pose by it alone
+_SAME_PX = 4.0  # a detection so near to the projection of a light is that light; at least, its own radius
 Methods = tuple[str, ...]
 Pictures = list[tuple[Row, bytes]]  # a sequence in memory, as `rendered` gives it
 
@@ -208,8 +211,8 @@ def _median(values: Array) -> float | None:
     return float(np.median(values)) if len(values) else None
 
 
-def rendered_frames(simulation: Simulation) -> Iterator[tuple[float, Frame]]:
-    """True z and picture of each frame of a scenario."""
+def rendered_frames(simulation: Simulation) -> Iterator[tuple[Array, Frame]]:
+    """True T_dock_cam and picture of each frame of a scenario."""
     scenario, station, camera = simulation.load()
     t_ns, poses = trajectory(scenario, np.random.default_rng([simulation.seed, 0]))
     paths = np.random.default_rng([simulation.seed, 2])
@@ -219,4 +222,24 @@ def rendered_frames(simulation: Simulation) -> Iterator[tuple[float, Frame]]:
         image, _, _ = render_frame(
             scenario, station, camera, T_dock_cam, spurious[number], dark=nothing, rng=rng
         )  # fmt: skip
-        yield float(T_dock_cam[2, 3]), Frame(f"{number:06d}", t, image)
+        yield T_dock_cam, Frame(f"{number:06d}", t, image)
+
+
+def true_lights(detections: Detections, uv: Array) -> Indices:
+    """Light (N,) of each detection, -1 where none is near; `uv` (M, 2) px of the lights, NaN for those not to be seen.
+
+    A light belongs to the nearest detection within 4 px, or within that detection's own radius.
+    """
+    light = np.full(len(detections), -1, np.int64)
+    for i in np.flatnonzero(np.isfinite(uv[:, 0])):
+        away = np.linalg.norm(detections.uv - uv[i], axis=1)
+        if len(away) and away.min() <= max(_SAME_PX, float(np.nan_to_num(detections.radius_px[away.argmin()]))):
+            light[away.argmin()] = i
+    return light
+
+
+def over_limit(T_dock_cam: Array, true_T_dock_cam: Array) -> bool:
+    """Whether the error of a pose is over the alert limit at its distance."""
+    error = pose_error(T_dock_cam, true_T_dock_cam)
+    sizes = np.hypot(*error[:2]), abs(error[2]), np.linalg.norm(error[3:])
+    return bool((np.array(sizes) > DEFAULT_ALERT_LIMITS.of_pose(float(T_dock_cam[2, 3]), 0.0)).any())
