@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from bench.shipped import CAMERA_FILE, STATION_FILE
-from lumidock import __version__
 from lumidock.evaluation.campaign import source_digest
 from lumidock.report.page import PageSection, Table, markdown
 from lumidock.reproduce import QUICK, Dock, Plan, reproduce
@@ -24,7 +24,7 @@ class Shown:
         """The tables with their captions; what is done stays in the folder, and the same call goes on."""
         tables = [item for item in reproduced()[self.section].items if isinstance(item, Table)]
         chosen = [tables[number] for number in self.numbers or range(len(tables))]
-        lines = [f"Seeds from {QUICK.first_seed}; lumidock {__version__}+{source_digest()}."]
+        lines = [f"Seeds from {QUICK.first_seed}; lumidock {version('lumidock')}+{source_digest()}."]
         for table in chosen:
             lines += ["", *markdown(table).strip().splitlines()]
         return {table.caption: [list(table.head), *map(list, table.rows)] for table in chosen}, lines

@@ -39,7 +39,8 @@ def section(results: Results) -> PageSection:
         tiles.append(
             Tile(f"{met} of {len(rows)}", f"of the paper's figures met: {name}", "good" if met == len(rows) else "bad")
         )
-    return PageSection("The paper's figures", _TEXT, tiles=tiles, items=[_table(rows)])
+    machine = results["docking-0"]["machine"] if "docking-0" in results else ""
+    return PageSection("The paper's figures", _TEXT, tiles=tiles, items=[_table(rows, machine)])
 
 
 _TEXT = (
@@ -49,10 +50,10 @@ _TEXT = (
 )
 
 
-def _table(rows: list[tuple[str, str, list[Cell]]]) -> Table:
+def _table(rows: list[tuple[str, str, list[Cell]]], machine: str) -> Table:
     cells = [[name, paper, *(f"{text} {verdict}" for text, verdict in found)] for name, paper, found in rows]
-    machine = "Times are of this machine, the paper's of a Jetson AGX Xavier."
-    return Table(f"The paper's figures and those found here. {machine}", ["figure", "paper", *TITLES.values()], cells)
+    times = f" Times are of one core of {machine}, the paper's of a Jetson AGX Xavier." if machine else ""
+    return Table(f"The paper's figures and those found here.{times}", ["figure", "paper", *TITLES.values()], cells)
 
 
 def _rows(results: Results) -> list[tuple[str, str, list[Cell]]]:
