@@ -28,6 +28,7 @@ from lumidock.sim.detections import simulated_frames
 from lumidock.sim.scenario import poses, rotations
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Results = Mapping[str, Any]
@@ -50,7 +51,9 @@ _TEXT = (
     "detection as it should be; wrong: some identity is not its own; the rest is refused or partial. Hazardous: a "
     "pose is given whose error is over the alert limit at its distance, whatever its identities; of lumidock only "
     "valid poses count. Each baseline is written from its paper and reproduces a property that the paper states, as a "
-    "test of this package."
+    "test of this package. One-to-one methods have to use a spurious detection as soon as a light is missing as well, "
+    "and refuse by the residual. The vote and RANSAC do not know which way a light shines: on a front layer that "
+    "equals its mirror image a pose from behind the dock fits as well, and their wrong answers there are such poses."
 )
 
 
@@ -218,19 +221,15 @@ def _draw(figure: Figure, totals: Mapping[str, list[int]], frames: int) -> None:
     for k, (right, wrong, _, hazardous) in enumerate(totals.values()):
         axes.barh(k, 100.0 * right / frames, 0.62, color=COLORS["transition"])
         axes.barh(k, 100.0 * wrong / frames, 0.62, left=100.0 * right / frames, color=COLORS["bad"])
-        axes.barh(
-            k,
-            100.0 * hazardous / frames,
-            0.2,
-            left=100.0 * right / frames,
-            facecolor="none",
-            edgecolor=COLORS["ink"],
-            hatch="////",
-            lw=0.5,
-        )
+        if hazardous:
+            _hatch(axes, k, 100.0 * right / frames, 100.0 * hazardous / frames)
     axes.set_yticks(range(len(totals)), [title(name) for name in totals])
     axes.set(ylim=(len(totals) - 0.4, -0.6), xlim=(0, 105), xlabel="frames, %")
     axes.grid(axis="y", visible=False)
+
+
+def _hatch(axes: Axes, row: int, left: float, width: float) -> None:
+    axes.barh(row, width, 0.2, left=left, facecolor="none", edgecolor=COLORS["ink"], hatch="////", lw=0.5)
 
 
 def _solver_table(results: Results) -> Table:

@@ -158,8 +158,10 @@ def _items(pictures: Pictures) -> Iterator[Frame | Unusable]:
 
 
 def _warm(localizer: Method, pictures: Pictures) -> None:
-    """Compile before times are taken: the first frames of a machine take seconds more."""
-    for item in _items(pictures[:: max(1, len(pictures) // 6)]):
+    """Compile before times are taken, for frames with and without a frame before: the first of them take seconds."""
+    count = len(pictures)
+    chosen = {*range(0, count, max(1, count // 6)), *range(count // 2, count // 2 + 6), *range(count - 4, count)}
+    for item in _items([pictures[k] for k in sorted(chosen & set(range(count)))]):
         with suppress(FrameError):
             if isinstance(item, Frame):
                 localizer.process(item)
