@@ -52,7 +52,7 @@ _TEXT = (
 
 def _table(rows: list[tuple[str, str, list[Cell]]], machine: str) -> Table:
     cells = [[name, paper, *(f"{text} {verdict}" for text, verdict in found)] for name, paper, found in rows]
-    times = f" Times are of one core of {machine}, the paper's of a Jetson AGX Xavier." if machine else ""
+    times = f" CPU times are of one core of {machine}, the paper's of a Jetson AGX Xavier." if machine else ""
     return Table(f"The paper's figures and those found here.{times}", ["figure", "paper", *TITLES.values()], cells)
 
 
@@ -96,12 +96,12 @@ def _docking_rows(result: dict[str, Any]) -> list[tuple[str, str, list[Cell]]]:
         ("offset of the layers, m", f"< {LAYER_OFFSET_M:g}", _offset, lambda m: m < LAYER_OFFSET_M),
         ("farthest off the axis, m", f"< {AXIS_M:g}", lambda r: r["off_axis_m"], lambda m: m < AXIS_M),
         (
-            "single layer, ms a frame",
+            "single layer, CPU ms a frame",
             f"{SINGLE_LAYER_MS:g}",
             lambda r: r["ms"]["single"],
             lambda ms: ms <= SINGLE_LAYER_MS,
         ),
-        ("dual layer, ms a frame", f"{DUAL_LAYER_MS:g}", lambda r: r["ms"]["dual"], lambda ms: ms <= DUAL_LAYER_MS),
+        ("dual layer, CPU ms a frame", f"{DUAL_LAYER_MS:g}", lambda r: r["ms"]["dual"], lambda ms: ms <= DUAL_LAYER_MS),
     ]
     return [(name, paper, [_claim(value(result[m]), good) for m in _METHODS]) for name, paper, value, good in claims]
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import platform
 import shutil
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,11 +142,28 @@ def _run_method(setup: Setup, pictures: Pictures, out: Path) -> dict[str, Any]:
     inputs = (sequence / "timestamps.csv",)
     source = Source(sequence, "sequence", lambda _: _items(pictures), len(pictures), inputs=inputs)
     _warm(localizer_of(setup.method, station, camera, setup.config), pictures)
+    timed = _Timed(localizer_of(setup.method, station, camera, setup.config))
     with RunFolder(out, station.ids) as run_folder:
         for file, name in ((setup.station, "station.yaml"), (setup.camera, "camera.yaml")):
             shutil.copyfile(file, out / name)
-        run(source, localizer_of(setup.method, station, camera, setup.config), run_folder, setup)
-    return evaluate(out, sequence) | reach(out, sequence)
+        run(source, timed, run_folder, setup)
+    return evaluate(out, sequence) | reach(out, sequence, timed.cpu_ms)
+
+
+class _Timed:
+    """A method whose CPU time is kept by frame: unlike the time that passes, it bears other work on the machine."""
+
+    def __init__(self, localizer: Method) -> None:
+        self.cpu_ms: dict[str, float] = {}
+        self.process_detections, self.forget = localizer.process_detections, localizer.forget
+        self._process = localizer.process
+
+    def process(self, frame: Frame) -> Fix:
+        """Fix of one frame. Raises: FrameError."""
+        start = time.process_time()
+        fix = self._process(frame)
+        self.cpu_ms[frame.name] = 1e3 * (time.process_time() - start)
+        return fix
 
 
 def _items(pictures: Pictures) -> Iterator[Frame | Unusable]:
@@ -167,20 +185,20 @@ def _warm(localizer: Method, pictures: Pictures) -> None:
                 localizer.process(item)
 
 
-def reach(run_folder: Path, truth: Path) -> dict[str, Any]:
+def reach(run_folder: Path, truth: Path, cpu_ms: Mapping[str, float]) -> dict[str, Any]:
     """Where a run could first and last be used, by true z: at all, and by four or more identified lights of each layer.
 
-    Also how far from the dock's axis its poses were, and its times with one layer identified and with more.
+    Also how far from the dock's axis its poses were, and its CPU times with one layer identified and with more.
     """
     station, true = load_station(run_folder / "station.yaml"), true_poses(truth)
-    rows = [(fix, us) for fix, _, us in read_fixes(run_folder, station.ids) if fix.frame in true]
-    identified = np.array([_identified_by_layer(fix, station) for fix, _ in rows]).reshape(len(rows), -1)
-    z = np.array([true[fix.frame][2, 3] for fix, _ in rows])
-    valid = np.array([fix.valid for fix, _ in rows], bool)
-    guided = np.array([fix.guide is not None for fix, _ in rows], bool)
-    ms = np.array([np.nan if us is None else us * 1e-3 for _, us in rows])
+    fixes = [fix for fix, _, _ in read_fixes(run_folder, station.ids) if fix.frame in true]
+    identified = np.array([_identified_by_layer(fix, station) for fix in fixes]).reshape(len(fixes), -1)
+    z = np.array([true[fix.frame][2, 3] for fix in fixes])
+    valid = np.array([fix.valid for fix in fixes], bool)
+    guided = np.array([fix.guide is not None for fix in fixes], bool)
+    ms = np.array([cpu_ms.get(fix.frame, np.nan) for fix in fixes])
     layers = (identified >= _FOUR).sum(axis=1)
-    off_axis = [float(np.hypot(*fix.T_dock_cam[:2, 3])) for fix, _ in rows if fix.T_dock_cam is not None]
+    off_axis = [float(np.hypot(*fix.T_dock_cam[:2, 3])) for fix in fixes if fix.T_dock_cam is not None]
     usable = valid | guided
     by_layer = {
         name: first_and_last(z, usable & (identified[:, k] >= _FOUR)) for name, k in (("front", 0), ("rear", -1))
