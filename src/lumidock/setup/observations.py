@@ -16,7 +16,7 @@ from lumidock.station import Station
 
 LEAST_LIGHTS = 4  # three lights fit up to four poses, so a frame with fewer than four says nothing of positions
 Progress = Callable[[int, int | None], None]
-_ANY_ROLL = 1e-6  # share of approaches with any roll, the least that `prior.any_roll` takes
+_ANY_ROLL = 1e-9  # share of approaches with any roll, the least that `prior.any_roll` takes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
