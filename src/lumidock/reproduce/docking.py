@@ -67,12 +67,17 @@ def section(plan: Plan, results: Results) -> PageSection:
     chosen = {name: replace(view, name=title(name)) for name, view in zip(plan.methods, views, strict=True)}
     by_layer = [_figure_16(view, name) for name, view in chosen.items()]
     compared = [chosen["lumidock"], chosen["paper"]]
-    trajectories = [figures.trajectory(chosen[name], f"docking-{name}") for name in ("lumidock", "paper")]
+    trajectories = [_trajectory(chosen[name], name) for name in ("lumidock", "paper")]
     return PageSection(
         "Figures 15 and 16: the docking",
         _TEXT,
         items=[*_figure_15(chosen), table, *by_layer, *figures.comparison(compared, "docking"), *trajectories],
     )
+
+
+def _trajectory(view: RunView, name: str) -> Plot:
+    shown = figures.trajectory(view, f"docking-{name}")
+    return replace(shown, caption=f"{title(name)}. {shown.caption}")
 
 
 def _figure_15(views: Mapping[str, RunView]) -> list[AnnotatedImage]:

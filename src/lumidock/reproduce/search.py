@@ -107,7 +107,7 @@ def _table(plan: Plan, folder: Path, results: Results) -> Table:
     for side in SIDES:
         for name in plan.methods:
             r = by_method[name][side]
-            rms = f"{r['lateral_m']:.2f} / {r['axial_m']:.2f}" if r["valid"] else "-"
+            rms = f"{r['lateral_m']:.3f} / {r['axial_m']:.3f}" if r["valid"] else "-"
             guide = f"{r['guide']:.0f}" if name == "lumidock" else "gives none"
             cells = [f"{r[word]:.0f}" for word in ("frames", "four", "valid")]
             rows.append([f"{side}: {title(name)}", *cells, guide, rms, f"{r['flipped']:.0f}"])
