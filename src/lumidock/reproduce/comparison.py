@@ -53,7 +53,7 @@ _TEXT = (
     "valid poses count. Each baseline is written from its paper and reproduces a property that the paper states, as a "
     "test of this package. One-to-one methods have to use a spurious detection as soon as a light is missing as well, "
     "and refuse by the residual. The vote and RANSAC do not know which way a light shines: on a front layer that "
-    "equals its mirror image, as both of the other layouts do, a pose from behind the dock fits as well as the true one."
+    "equals its mirror image, as both other layouts do, a pose from behind the dock fits as well as the true one."
 )
 
 
