@@ -62,11 +62,11 @@ BENCHES = {
     "docks": docks,
     "visibility": visibility,
     "rendering": rendering,
-    "reproduced": reproduced,
     "contact-sheet": contact_sheet,
     "configuration": configuration,
     "console": console,
     "console-pictures": console_pictures,
+    **reproduced.TABLES,
 }
 
 

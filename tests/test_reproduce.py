@@ -17,7 +17,7 @@ from lumidock.datatypes import Detections, Fix, Match
 from lumidock.errors import InputError
 from lumidock.localizer import Localizer
 from lumidock.report.page import Table
-from lumidock.reproduce import EXPERIMENTS, FULL, QUICK, Dock, Plan, reproduce, work
+from lumidock.reproduce import EXPERIMENTS, FULL, QUICK, Dock, Plan, layer_rules, reproduce, work
 from lumidock.reproduce.experiments import chosen, jobs_of
 from lumidock.reproduce.intervals import BETTER, LIKE, WORSE, mark, wilson
 from lumidock.reproduce.jobs import Job, run_jobs
@@ -162,6 +162,22 @@ def test_what_is_done_is_not_done_again_and_what_changed_or_is_gone_is(tmp_path)
     assert run_jobs([job], tmp_path, "dock", workers=0) == first
     other = replace(job, arguments=(replace(simulation, seed=4), ("paper", "lumidock"), Config()))
     assert json.loads(file.read_text())["key"] != other.key("dock")
+
+
+def test_rules_for_the_layers_differ_only_where_their_input_does():
+    """Without colour every rule but colour alone is the rule by radius; by colour no gray detection is a rear one."""
+    settings = ("path.start_z_m=9", "path.end_z_m=4", "path.frame_interval_s=1.6")
+    result = layer_rules.measure(Simulation(DOCK, "approach", settings, 3), Config())
+    gray, color = result["gray"], result["colour"]
+    assert gray["auto"] == gray["color_or_radius"] == gray["radius"] != gray["color"]
+    assert gray["color"]["detections"] == gray["radius"]["detections"] > 30
+    front = gray["color"]["right_layer"]
+    assert 0 < front <= 7 * gray["color"]["frames"]
+    assert color["color"] == color["auto"]
+    assert color["color"]["right_layer"] >= 0.95 * color["color"]["detections"] > front
+    assert color["color"]["wrong"] == 0
+    rows = layer_rules.table({"layer-rules": result}).rows
+    assert len(rows) == 2 * len(layer_rules.RULES)
 
 
 def test_tables_are_whole_as_csv_and_latex():
@@ -310,4 +326,4 @@ def test_reproduction_goes_on_where_it_was_and_its_page_is_whole(tmp_path):
     if CHROMIUM:
         for width in (1200, 360):
             assert probe(tmp_path / "page.html", text, width, False) == "PROBED rgb(255, 255, 255) "
-        assert "PROBED" in probe(tmp_path / "page.html", text, 1200, True)
+            assert probe(tmp_path / "page.html", text, width, True) == "PROBED rgb(17, 23, 29) "

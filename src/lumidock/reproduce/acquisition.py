@@ -22,7 +22,8 @@ SCENARIOS = {
 }
 _TEXT = (
     "The paper's conclusion says that missing and spurious lights together defeat its method before its first fix. "
-    "Answers are frames with identities, right ones have every identity right, wrong ones at least one wrong."
+    "Answers are frames with identities; right ones have every identity right, wrong ones at least one wrong, and the "
+    "other answers leave lights out. On the last two rows every answer would be wrong."
 )
 
 

@@ -43,9 +43,10 @@ _TEXT = (
     "below how often each method is right over many independent frames at point level."
 )
 _FILTER_TEXT = (
-    "Figure 7 shows a light missing and a noisy point; figure 11 two frames one after the other: first a spurious "
-    "light appears, then a true one goes dark while it stays. One-to-one assignment has to give the spurious "
-    "detection the place of the missing light; the filter, which knows where the lights must be, does not."
+    "The paper's figure 7 draws the way through the filter for a light missing and a noisy point; its figure 11 two "
+    "frames one after the other: first a spurious light appears, then a true one goes dark while it stays. The same "
+    "two frames here at point level. One-to-one assignment has to give the spurious detection the place of the missing "
+    "light; the filter, which knows where the lights must be, does not. Table 1 counts many such frames."
 )
 
 

@@ -29,7 +29,7 @@ from lumidock.reproduce.trials import (
     merged,
     trial,
 )
-from lumidock.reproduce.work import Methods, Simulation
+from lumidock.reproduce.work import Methods, Simulation, true_lights
 from lumidock.sim.detections import dark_lights, in_view
 from lumidock.sim.scenario import spurious_paths, trajectory
 from lumidock.sim.sequence import render_frame
@@ -37,7 +37,6 @@ from lumidock.sim.sequence import render_frame
 Results = Mapping[str, Any]
 ROWS = (*((*faults, False) for faults in TABLE_1), (1, 1, False), (1, 1, True), (3, 2, True))
 SMALL, LARGE = "20 x 40, printed bounds", "80 x 120, wide bounds"
-_SAME_PX = 4.0  # a detection so near to the projection of a light is that light; at least, its own radius
 _TEXT = (
     "The paper's section 4.1 at point level: centroids with 0.5 px of noise, runs toward the dock at 1.5 m/s and 4 "
     "Hz. A frame counts when all seven front lights are in view. It is right when every true detection carries the "
@@ -149,11 +148,7 @@ def count_rendered(simulation: Simulation, methods: Methods, config: Config) -> 
 
 def _judged(detections: Detections, light: Indices, uv: Array, front: Indices) -> Count:
     """One frame: right where every front light that was detected is identified, and nothing wrongly."""
-    truth = np.full(len(detections), -1)
-    for i in np.flatnonzero(np.isfinite(uv[:, 0])):
-        away = np.linalg.norm(detections.uv - uv[i], axis=1)
-        if len(away) and away.min() <= max(_SAME_PX, float(np.nan_to_num(detections.radius_px[away.argmin()]))):
-            truth[away.argmin()] = i
+    truth = true_lights(detections, uv)
     wrong = bool((light != truth)[light >= 0].any())
     complete = bool(np.isin(truth[np.isin(truth, front)], light).all())
     return Count(1, bool((light >= 0).any()) and complete and not wrong, wrong)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import platform
 import shutil
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from lumidock.alert_limits import DEFAULT_ALERT_LIMITS
 from lumidock.app.run import Setup, run
 from lumidock.camera import Camera, load_camera
 from lumidock.config import Config
-from lumidock.datatypes import Array, Fix, Frame, Unusable
+from lumidock.datatypes import Array, Detections, Fix, Frame, Indices, Unusable
 from lumidock.errors import FrameError
 from lumidock.evaluation.campaign import plan, run_shard
 from lumidock.evaluation.campaign_table import row_of
+from lumidock.evaluation.claims import pose_error
 from lumidock.evaluation.counts import Tally
 from lumidock.evaluation.metrics import evaluate, true_poses
 from lumidock.methods import Method, localizer_of
@@ -35,6 +38,7 @@ from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.source import Source
 
 _FOUR = 4  # identified lights of a layer that give a pose by it alone
+_SAME_PX = 4.0  # a detection so near to the projection of a light is that light; at least, its own radius
 Methods = tuple[str, ...]
 Pictures = list[tuple[Row, bytes]]  # a sequence in memory, as `rendered` gives it
 
@@ -138,11 +142,28 @@ def _run_method(setup: Setup, pictures: Pictures, out: Path) -> dict[str, Any]:
     inputs = (sequence / "timestamps.csv",)
     source = Source(sequence, "sequence", lambda _: _items(pictures), len(pictures), inputs=inputs)
     _warm(localizer_of(setup.method, station, camera, setup.config), pictures)
+    timed = _Timed(localizer_of(setup.method, station, camera, setup.config))
     with RunFolder(out, station.ids) as run_folder:
         for file, name in ((setup.station, "station.yaml"), (setup.camera, "camera.yaml")):
             shutil.copyfile(file, out / name)
-        run(source, localizer_of(setup.method, station, camera, setup.config), run_folder, setup)
-    return evaluate(out, sequence) | reach(out, sequence)
+        run(source, timed, run_folder, setup)
+    return evaluate(out, sequence) | reach(out, sequence, timed.cpu_ms)
+
+
+class _Timed:
+    """A method whose CPU time is kept by frame: unlike the time that passes, it bears other work on the machine."""
+
+    def __init__(self, localizer: Method) -> None:
+        self.cpu_ms: dict[str, float] = {}
+        self.process_detections, self.forget = localizer.process_detections, localizer.forget
+        self._process = localizer.process
+
+    def process(self, frame: Frame) -> Fix:
+        """Fix of one frame. Raises: FrameError."""
+        start = time.process_time()
+        fix = self._process(frame)
+        self.cpu_ms[frame.name] = 1e3 * (time.process_time() - start)
+        return fix
 
 
 def _items(pictures: Pictures) -> Iterator[Frame | Unusable]:
@@ -155,27 +176,29 @@ def _items(pictures: Pictures) -> Iterator[Frame | Unusable]:
 
 
 def _warm(localizer: Method, pictures: Pictures) -> None:
-    """Compile before times are taken: the first frames of a machine take seconds more."""
-    for item in _items(pictures[:: max(1, len(pictures) // 6)]):
+    """Compile before times are taken, for frames with and without a frame before: the first of them take seconds."""
+    count = len(pictures)
+    chosen = {*range(0, count, max(1, count // 6)), *range(count // 2, count // 2 + 6), *range(count - 4, count)}
+    for item in _items([pictures[k] for k in sorted(chosen & set(range(count)))]):
         with suppress(FrameError):
             if isinstance(item, Frame):
                 localizer.process(item)
 
 
-def reach(run_folder: Path, truth: Path) -> dict[str, Any]:
+def reach(run_folder: Path, truth: Path, cpu_ms: Mapping[str, float]) -> dict[str, Any]:
     """Where a run could first and last be used, by true z: at all, and by four or more identified lights of each layer.
 
-    Also how far from the dock's axis its poses were, and its times with one layer identified and with more.
+    Also how far from the dock's axis its poses were, and its CPU times with one layer identified and with more.
     """
     station, true = load_station(run_folder / "station.yaml"), true_poses(truth)
-    rows = [(fix, us) for fix, _, us in read_fixes(run_folder, station.ids) if fix.frame in true]
-    identified = np.array([_identified_by_layer(fix, station) for fix, _ in rows]).reshape(len(rows), -1)
-    z = np.array([true[fix.frame][2, 3] for fix, _ in rows])
-    valid = np.array([fix.valid for fix, _ in rows], bool)
-    guided = np.array([fix.guide is not None for fix, _ in rows], bool)
-    ms = np.array([np.nan if us is None else us * 1e-3 for _, us in rows])
+    fixes = [fix for fix, _, _ in read_fixes(run_folder, station.ids) if fix.frame in true]
+    identified = np.array([_identified_by_layer(fix, station) for fix in fixes]).reshape(len(fixes), -1)
+    z = np.array([true[fix.frame][2, 3] for fix in fixes])
+    valid = np.array([fix.valid for fix in fixes], bool)
+    guided = np.array([fix.guide is not None for fix in fixes], bool)
+    ms = np.array([cpu_ms.get(fix.frame, np.nan) for fix in fixes])
     layers = (identified >= _FOUR).sum(axis=1)
-    off_axis = [float(np.hypot(*fix.T_dock_cam[:2, 3])) for fix, _ in rows if fix.T_dock_cam is not None]
+    off_axis = [float(np.hypot(*fix.T_dock_cam[:2, 3])) for fix in fixes if fix.T_dock_cam is not None]
     usable = valid | guided
     by_layer = {
         name: first_and_last(z, usable & (identified[:, k] >= _FOUR)) for name, k in (("front", 0), ("rear", -1))
@@ -208,8 +231,8 @@ def _median(values: Array) -> float | None:
     return float(np.median(values)) if len(values) else None
 
 
-def rendered_frames(simulation: Simulation) -> Iterator[tuple[float, Frame]]:
-    """True z and picture of each frame of a scenario."""
+def rendered_frames(simulation: Simulation) -> Iterator[tuple[Array, Frame]]:
+    """True T_dock_cam and picture of each frame of a scenario."""
     scenario, station, camera = simulation.load()
     t_ns, poses = trajectory(scenario, np.random.default_rng([simulation.seed, 0]))
     paths = np.random.default_rng([simulation.seed, 2])
@@ -219,4 +242,24 @@ def rendered_frames(simulation: Simulation) -> Iterator[tuple[float, Frame]]:
         image, _, _ = render_frame(
             scenario, station, camera, T_dock_cam, spurious[number], dark=nothing, rng=rng
         )  # fmt: skip
-        yield float(T_dock_cam[2, 3]), Frame(f"{number:06d}", t, image)
+        yield T_dock_cam, Frame(f"{number:06d}", t, image)
+
+
+def true_lights(detections: Detections, uv: Array) -> Indices:
+    """Light (N,) of each detection, -1 where none is near; `uv` (M, 2) px of the lights, NaN for those not to be seen.
+
+    A light belongs to the nearest detection within 4 px, or within that detection's own radius.
+    """
+    light = np.full(len(detections), -1, np.int64)
+    for i in np.flatnonzero(np.isfinite(uv[:, 0])):
+        away = np.linalg.norm(detections.uv - uv[i], axis=1)
+        if len(away) and away.min() <= max(_SAME_PX, float(np.nan_to_num(detections.radius_px[away.argmin()]))):
+            light[away.argmin()] = i
+    return light
+
+
+def over_limit(T_dock_cam: Array, true_T_dock_cam: Array) -> bool:
+    """Whether the error of a pose is over the alert limit at its distance."""
+    error = pose_error(T_dock_cam, true_T_dock_cam)
+    sizes = np.hypot(*error[:2]), abs(error[2]), np.linalg.norm(error[3:])
+    return bool((np.array(sizes) > DEFAULT_ALERT_LIMITS.of_pose(float(T_dock_cam[2, 3]), 0.0)).any())
