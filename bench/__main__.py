@@ -20,6 +20,7 @@ from bench import (
     closed_loop,
     configuration,
     console,
+    console_memory,
     console_pictures,
     contact_sheet,
     detection,
@@ -66,6 +67,7 @@ BENCHES = {
     "contact-sheet": contact_sheet,
     "configuration": configuration,
     "console": console,
+    "console-memory": console_memory,
     "console-pictures": console_pictures,
 }
 

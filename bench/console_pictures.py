@@ -37,16 +37,23 @@ def simulate(folder: Path) -> Path:
 
 
 @contextmanager
-def address_of(*words: object) -> Iterator[str]:
-    """A command of lumidock that serves the console, and the address that it prints."""
+def started(*words: object) -> Iterator[tuple[str, int]]:
+    """A command of lumidock that serves the console: the address that it prints, and the number of its process."""
     command = [sys.executable, "-m", "lumidock", *map(str, words)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
-        yield process.stdout.readline().split()[-1]
+        yield process.stdout.readline().split()[-1], process.pid
     finally:
         process.terminate()
         process.wait(30)
+
+
+@contextmanager
+def address_of(*words: object) -> Iterator[str]:
+    """The address of such a command alone."""
+    with started(*words) as (address, _):
+        yield address
 
 
 def opened(browser: Browser, address: str, size: tuple[int, int], scheme: str) -> Page:
