@@ -38,7 +38,7 @@ def main() -> tuple[dict[str, object], list[str]]:
     first, last = used[minutes < 1].max(), used[minutes >= _MINUTES - 1].max()
     slope = np.polyfit(minutes[minutes >= 1], used[minutes >= 1], 1)[0]
     lines = [
-        "| most in the first minute, MB | most in the tenth minute, MB | slope from the second minute on, MB a minute |",
+        "| most in the first minute, MB | most in the tenth minute, MB | slope after the first minute, MB a minute |",
         "|---|---|---|",
         f"| {first:.0f} | {last:.0f} | {slope:+.2f} |",
     ]

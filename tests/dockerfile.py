@@ -65,10 +65,12 @@ class Stage:
         (folder / "tmp").chmod(0o1777)
         (folder / "etc/passwd").write_text(ACCOUNTS)
         (folder / "etc/group").write_text("root:x:0:\n")
+        (folder / "etc/ld.so.conf").write_text("/usr/local/lib\n")
         shutil.copy("/etc/resolv.conf", folder / "etc")
         shutil.copytree("/etc/ssl/certs", folder / "etc/ssl/certs", symlinks=False, ignore_dangling_symlinks=True)
         for shared in filter(Path.is_dir, map(Path, os.environ.get("PIP_FIND_LINKS", "").split())):
             (folder / str(shared).lstrip("/")).mkdir(parents=True)  # what pip is told to look into may be empty here
+        self.run(["/sbin/ldconfig"])  # or this Python would load the library of another
 
     def command(self, words):
         """The command line that runs `words` inside."""

@@ -99,7 +99,8 @@ def test_an_engine_builds_it_and_it_is_healthy():
     if found is None:
         pytest.skip("neither docker nor podman has an engine that answers")
     subprocess.run([found, "build", "--tag", NAME, str(ROOT)], check=True, timeout=3600)
-    started = [found, "run", "--detach", "--rm", "--name", NAME, NAME, "serve", "sim:approach", *SHORT, "--loop"]
+    inside = f"lumidock sim approach {' '.join(SHORT)} --out /tmp/a && exec lumidock serve /tmp/a --loop"
+    started = [found, "run", "--detach", "--rm", "--name", NAME, "--entrypoint", "sh", NAME, "-c", inside]
     subprocess.run(started, check=True, timeout=60)
     try:
         end = time.monotonic() + 300
