@@ -14,8 +14,9 @@ RUN /opt/lumidock/bin/pip install --constraint /source/constraints.txt '/source[
 FROM python:${PYTHON}-slim-bookworm
 COPY --from=build /opt/lumidock /opt/lumidock
 # kernels are compiled here, for any processor of the architecture, and found again where the image runs
-ENV PATH=/opt/lumidock/bin:/usr/local/bin:/usr/bin:/bin NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR=/var/cache/lumidock HOME=/data
-RUN useradd --uid 10001 --home-dir /data --no-create-home --shell /usr/sbin/nologin lumidock \
+ENV PATH=/opt/lumidock/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR=/var/cache/lumidock HOME=/data
+RUN groupadd --gid 10001 lumidock \
+ && useradd --uid 10001 --gid 10001 --home-dir /data --no-create-home --shell /usr/sbin/nologin lumidock \
  && install --directory --owner 10001 --group 10001 /data /var/cache/lumidock
 USER lumidock
 RUN lumidock warm

@@ -40,6 +40,11 @@ def writing(console):
     return [route.path for route in application(console).routes if getattr(route, "methods", None) == {"POST"}]
 
 
+def test_blueos_is_told_what_answers_here(live):
+    found = client(live, "0.0.0.0", "http://localhost:8780").get("/register_service").json()
+    assert {"name", "description", "icon", "company", "version", "webpage", "api"} <= found.keys()
+
+
 def test_nothing_is_written_without_the_token(live):
     page, paths = client(live), writing(live)
     assert len(paths) >= 10

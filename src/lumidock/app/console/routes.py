@@ -97,6 +97,7 @@ def application(console: Console) -> Starlette:
     reading = {
         "/": _page("index.html"),
         "/health.json": of.health,
+        "/register_service": of.service,
         "/api/about": of.about,
         "/api/settings": of.settings,
         "/api/recording": of.recording,
@@ -183,6 +184,21 @@ class _Api:
 
     async def health(self, _request: Request) -> Response:
         return JSONResponse(self._console.health())
+
+    async def service(self, _request: Request) -> Response:
+        """What BlueOS asks every port for, to list its services."""
+        return JSONResponse(
+            {
+                "name": "lumidock",
+                "description": "Where the vehicle is relative to its dock",
+                "icon": "mdi-lighthouse",
+                "company": "lumidock",
+                "version": version("lumidock"),
+                "webpage": "",
+                "api": "/health.json",
+                "new_page": True,
+            }
+        )
 
     async def about(self, request: Request) -> Response:
         it = self._console
