@@ -82,8 +82,13 @@ def test_commands_page_is_what_the_code_says():
 def test_every_option_that_a_page_names_exists():
     known = set(re.findall(r"--[a-z][a-z0-9-]+", (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")))
     for page in PAGES:
-        for line in re.findall(r"^ *(lumidock .*)$", page.read_text(encoding="utf-8").replace("\\\n", " "), re.MULTILINE):
-            assert set(re.findall(r"(?<= )--[a-z][a-z0-9-]+", line)) <= known | {"--help", "--version"}, (page.name, line)
+        for line in re.findall(
+            r"^ *(lumidock .*)$", page.read_text(encoding="utf-8").replace("\\\n", " "), re.MULTILINE
+        ):
+            assert set(re.findall(r"(?<= )--[a-z][a-z0-9-]+", line)) <= known | {"--help", "--version"}, (
+                page.name,
+                line,
+            )
 
 
 def test_the_site_has_every_page():

@@ -10,8 +10,10 @@ from asking import BEARER, HEAD_ON, client, result
 from commandline import wait_for
 
 from lumidock.app.console.jobs import Jobs
+from lumidock.app.console.limits import Choice
 from lumidock.app.console.replay import Recording, Replay, events
 from lumidock.app.console.stretch import write_stretch
+from lumidock.app.console.wizards import Files
 from lumidock.config import Config
 from lumidock.datatypes import Fix, Guide
 from lumidock.streams.sources import open_source
@@ -112,7 +114,9 @@ def test_a_run_without_its_frames_is_replayed_and_repeated(bare, tmp_path, lumid
     replay = Replay(recording, jobs, tmp_path)
     replay.start()
     wait_for(lambda: replay.ended)
-    job = replay.rerun("lumidock", Config(), "again", None)
+    job = replay.rerun(
+        "lumidock", Choice(Config(), Files(run / "station.yaml", run / "camera.yaml", tmp_path)), "again", None
+    )
     wait_for(lambda: job.state in ("done", "failed"), 120)
     assert job.state == "done", job.line
     variants = replay.view()["variants"]
