@@ -169,8 +169,6 @@ def test_a_frame_that_leaves_its_answer_open_lists_the_poses_that_fit(rng):
         {"match": {"log_mirror": 1000.0}},
         {"match": {"least_detections": 10**9}},
         {"prior": {"roll_deg": 1e-6}},
-        {"integrity": {"evidence": 1.0}},
-        {"integrity": {"gathered_frames": 1}},
         {"integrity": {"fault": 1e-9}},
         {"detect": {"max_lights": 10**9}},
         {"detect": {"floor_px": 1e-9}},
@@ -223,3 +221,36 @@ def test_a_frozen_picture_of_one_light_is_told_by_its_pixels(rng):
         first = replace(predicted.tracks[0], last=last)
         moved = replace(predicted, tracks=(first,), measurements=None)
         assert tracking.is_frozen(state, moved, frame, localizer.context) == said
+
+
+def two_squares(tmp_path):
+    """A dock of four white lights in front of four blue ones: a square that is missing one is like the other."""
+    front = [(-0.9, 0.9), (0.9, 0.93), (0.88, -0.9), (-0.95, -0.86)]
+    rear = [(-0.6, 0.62), (0.6, 0.57), (0.63, -0.6), (-0.57, -0.6)]
+    rows = [f"{{id: F{k}, layer: front, position: [{x}, {y}, 0], color: white}}" for k, (x, y) in enumerate(front)]
+    rows += [f"{{id: R{k}, layer: rear, position: [{x}, {y}, -3], color: blue}}" for k, (x, y) in enumerate(rear)]
+    path = tmp_path / "two-squares.yaml"
+    path.write_text("schema: 1\nname: two squares\nlights:\n" + "".join(f"  - {row}\n" for row in rows))
+    return load_station(path)
+
+
+# Three front lights from 19 m, and a glint 8 cm beside the missing fourth: as much like the rear square from 8 m.
+GLINT_FOR_A_LIGHT = np.array([[1155.0, 1014.0], [1348.0, 1019.0], [1140.0, 1204.0], [1341.0, 1208.0]])
+
+
+def test_an_array_of_lights_and_a_glint_is_not_proven_by_repeating_itself(tmp_path, rng):
+    localizer = Localizer(two_squares(tmp_path), CAMERA)
+    for k in range(60):
+        uv = GLINT_FOR_A_LIGHT + rng.normal(0.0, 0.5, (4, 2))
+        fix = localizer.process_detections(Detections.from_uv(str(k), k * 66_000_000, uv, p_rear=np.full(4, 0.05)))
+        assert not fix.valid
+
+
+def test_a_track_is_not_given_up_for_another_array_of_one_frame(tmp_path, rng):
+    localizer = Localizer(two_squares(tmp_path), CAMERA)
+    front = np.vstack([GLINT_FOR_A_LIGHT[:3], GLINT_FOR_A_LIGHT[3] + [-6.0, 8.0]])
+    for k in range(60):
+        seen = GLINT_FOR_A_LIGHT if k % 20 == 19 else front
+        uv = seen + rng.normal(0.0, 0.5, (4, 2))
+        localizer.process_detections(Detections.from_uv(str(k), k * 66_000_000, uv, p_rear=np.full(4, 0.05)))
+        assert np.linalg.norm(localizer.state.first.state.t) > 14.0  # the rear square would be at 8 m

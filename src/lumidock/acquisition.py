@@ -93,11 +93,12 @@ def confirm(
     if not begun:
         return replace(state, calibration=calibration), False
     held = [replace(one, log_weight=head.log_evidence) for one in still_held]
+    disputed = any(verify.contradict(one.last.assignment, head.assignment) for one in held)
     confirmed = replace(
         state,
         hypotheses=likeliest([*held, *begun], context),
         confirmed=True,
-        margin=max(found.certainty, context.config.match.margin),
+        margin=context.config.match.margin if disputed else max(found.certainty, context.config.match.margin),
         thin_frames=0,
         calibration=calibration,
     )

@@ -223,7 +223,7 @@ class PriorConfig(SettingsGroup):
     pitch_deg: Degrees = 15.0
     yaw_deg: Degrees = 15.0
     # share of approaches with any roll, beyond `match.roll_gate`; poses that fit there are rivals of this weight
-    any_roll: Annotated[float, Field(ge=1e-6, le=0.5)] = 1e-3
+    any_roll: Annotated[float, Field(ge=1e-9, le=0.5)] = 1e-3
 
 
 class MatchConfig(SettingsGroup):
@@ -301,19 +301,13 @@ class TrackConfig(SettingsGroup):
 class IntegrityConfig(SettingsGroup):
     """When a pose may be used."""
 
-    risk: Risk = 1e-6  # probability in a frame that an error exceeds its protection level
+    # probability in a frame that an error exceeds its protection level, or that the association is wrong
+    risk: Risk = 1e-6
     # prior probability that an associated light is wrong, until geometry has proven it
     fault: Annotated[float, Field(ge=1e-6, le=0.1)] = 1e-3
     fault_proven: Annotated[float, Field(ge=1e-7, le=0.1)] = 2e-6  # afterwards; as often as in nominal campaigns
     # prior probability that a sensor of the vehicle is not as declared, until the lights have proven that it is
     fault_sensor: Annotated[float, Field(ge=1e-6, le=0.1)] = 1e-2
-    # log odds that meet the risk where too few lights check each other, -ln 1e-6
-    evidence: Annotated[float, Field(ge=4.6, le=1e3)] = 13.8
-    # frames in a row with four lights or more that agree, which meet it as well
-    carried_frames: Annotated[int, Field(ge=2, le=10_000)] = 2
-    gathered_frames: Annotated[int, Field(ge=5, le=10_000)] = (
-        15  # the same for an association that no single frame could decide
-    )
     # frames in a row with fewer than four lights, after which a fresh acquisition must agree
     thin_frames: Annotated[int, Field(ge=1, le=30)] = 3
     max_age_s: Age = 0.3  # of the last detected light, up to which a fix is predicted

@@ -163,20 +163,31 @@ def _arrived(state: LocalizerState, detections: Detections, predicted: Predictio
 def _tracked(
     state: LocalizerState, followed: Sequence[Track], detections: Detections, moment: Moment
 ) -> tuple[Fix, LocalizerState]:
-    """A confirmed track holds; where it may overlook a layer, the frame is acquired anew to compare."""
-    context = moment.context
+    """A confirmed track holds; where it is not proven or may overlook a layer, the frame is acquired anew."""
+    context, first = moment.context, followed[0]
     tracked = _checked(replace(state, hypotheses=tuple(followed), failures=0, dark_frames=0), moment)
-    if sees_two_layers(followed[0].last.count):
+    if sees_two_layers(first.last.count):
         tracked = replace(tracked, contradiction=None)
-    if not tracking.overlooks(followed[0], moment.frame, context):
+    overlooks = tracking.overlooks(first, moment.frame, context)
+    open_ = first.last.n_used >= CHECKED_LIGHTS and not verify.is_proven(
+        first, tracked.margin, context.config.integrity
+    )
+    if not (open_ or overlooks):
         return integrity.assess(tracked, detections, "tracking", context)
     found = moment.acquire()
-    if not _shows_two_layers(found, context):
-        against = moment.displaced_layer(followed[0]) or tracked.contradiction
-        return integrity.assess(replace(tracked, failures=1, contradiction=against), detections, "tracking", context)
-    # what the track has learned while it overlooked a layer is in doubt too; a failure, so that the next search is full
-    doubted = replace(state, confirmed=False, calibration=None, failures=1)
-    return _acquired(doubted, followed, detections, moment, found, still_held=followed[:1])
+    same_array = verify.finds_array(found, first.last.assignment, context.config.match)
+    if (overlooks and _shows_two_layers(found, context)) or (
+        open_ and not same_array and verify.is_answer(found, context.config.match)
+    ):
+        # what the track has learned meanwhile is in doubt too; a failure, so that the next search is full
+        doubted = replace(state, confirmed=False, calibration=None, failures=1)
+        return _acquired(doubted, followed, detections, moment, found, still_held=followed[:1])
+    if open_ and same_array:
+        tracked = replace(tracked, margin=max(tracked.margin, found.certainty))
+    if overlooks:
+        against = moment.displaced_layer(first) or tracked.contradiction
+        tracked = replace(tracked, failures=1, contradiction=against)
+    return integrity.assess(tracked, detections, "tracking", context)
 
 
 def _checked(state: LocalizerState, moment: Moment) -> LocalizerState:
@@ -210,7 +221,15 @@ def _lost(
     state = replace(state, dark_frames=state.dark_frames + 1 if dark else 0)
     if state.confirmed and followed and doubt == "residual" and state.failures == 1:  # one in many thousands, by chance
         return _coasting(state, detections, moment.context, doubt)
-    return _acquired(state, followed, detections, moment, moment.acquire(), doubt=doubt)
+    found = moment.acquire()
+    # three lights prove nothing, but the track that they hold is not given up for another array of one frame
+    holds = state.confirmed and doubt == "too_few"
+    held = (
+        followed[:1]
+        if holds and not verify.finds_array(found, followed[0].last.assignment, moment.context.config.match)
+        else ()
+    )
+    return _acquired(state, followed, detections, moment, found, doubt=doubt, still_held=held)
 
 
 def _doubt(followed: Sequence[Track], moment: Moment) -> str:

@@ -15,11 +15,12 @@ of everything that speaks against it,
 `mirror` holds the prior `log_mirror`; `crowding` is by how much, as a logarithm, unassigned detections stand denser
 around the assigned ones than the evidence's clutter has it. Lights of too small `odds_c` are dropped (`kept`).
 
-    certainty = margin - crowding, and no more than the configured margin where fewer than four lights are each
-                beyond doubt
+    certainty = log odds that the array is where A1 has it: as the margin, but for the associations that differ from A1
+                in one light only and share three others, whose pose is about the same, and less the crowding; no more
+                than the configured margin where fewer than four lights are each beyond doubt in this sense
 
-An answer has four lights and a margin over the configured one (`verify.is_answer`); `certainty` is what later frames
-may count on.
+An answer has four lights and a margin over the configured one (`verify.is_answer`). That one light is assigned wrongly
+is left to the protection levels; `certainty` is what an association is proven by (`verify.is_proven`).
 """
 
 from __future__ import annotations
@@ -218,14 +219,20 @@ def _decided(
     conflicting = scores[conflicts(kept, found.assignments)]
     against = float(np.logaddexp.reduce([-config.log_dock, mirror, *doubt.against[kept >= 0], *conflicting]))
     margin = best - against
-    beyond_doubt = int((odds[kept >= 0] > config.margin_gathered).sum()) >= CHECKED_LIGHTS
+    elsewhere = _cut(found, np.flatnonzero(~alike(kept, found.assignments)))
+    rivals_elsewhere = elsewhere.log_evidence[conflicts(kept, elsewhere.assignments)]
+    certainty = best - float(np.logaddexp.reduce([-config.log_dock, mirror, *rivals_elsewhere]))
+    unlabelled = doubt._replace(against=np.full(len(kept), _NONE))
+    certain = _odds(top, best, elsewhere, unlabelled, crowding)[kept >= 0] > config.margin_gathered
     direct = float(np.logaddexp.reduce([_NONE, *scores[(found.assignments != top.assignment).any(axis=1)]]))
     return Acquisition(
         hypotheses=(replace(top, assignment=kept), *_rest(found, kept, best - config.keep)),
         other_poses=tuple(replace(pose, assignment=kept) for pose in poses),
         margin=margin,
         reason=_why_open(best - config.margin, mirror, direct),
-        certainty=min(margin - crowding * min(unassigned, 1.0), math.inf if beyond_doubt else config.margin),
+        certainty=min(
+            certainty - crowding * min(unassigned, 1.0), math.inf if certain.sum() >= CHECKED_LIGHTS else config.margin
+        ),
     )
 
 
@@ -436,10 +443,32 @@ def _mirror_evidence(task: _Search, top: Hypothesis, *, all_mirrors: bool) -> fl
         found, complete = _search(task, task.mirrored(mirror), n, least, best=top.log_evidence)
         if not complete:
             return None
-        camera_y = -np.einsum("ki,ki->k", found.R[:, :, 1], found.t)
-        possible = (camera_y < 0.0) | all_mirrors
+        possible = _may_be_in_surface(found, task, mirror) | all_mirrors
         total = float(np.logaddexp.reduce([total, *found.log_evidence[possible]]))
     return total + task.config.log_mirror
+
+
+def alike(assignment: Indices, others: Indices) -> np.ndarray:
+    """Which of `others` (K, M) share three lights with `assignment` (M,) and assign one light otherwise at most.
+
+    The pose of three lights is about the same in both; a single wrong light is covered by the protection levels.
+    """
+    both = (assignment >= 0) & (others >= 0)
+    shared = (both & (assignment == others)).sum(axis=1)
+    other = (both & (assignment != others)).sum(axis=1)
+    return np.asarray((shared >= POSE_LIGHTS) & (other <= 1))
+
+
+def _may_be_in_surface(found: Hypotheses, task: _Search, mirror: Array) -> np.ndarray:
+    """Whether each of some mirror images may stand above the surface, and so above the camera (K,).
+
+    Its centre has to; and all of its lights, where the vehicle's tilt is known well enough to tell.
+    """
+    camera_y = -np.einsum("ki,ki->k", found.R[:, :, 1], found.t)
+    tilt_rad = 1.0 / math.sqrt(float(task.problem.info[:2].min()))
+    open_m = task.config.roll_gate * tilt_rad * np.linalg.norm(found.t, axis=1)
+    lowest = float((task.problem.p * mirror)[:, 1].min())
+    return np.asarray((camera_y < 0.0) & (camera_y - open_m < lowest))
 
 
 def conflicts(assignment: Indices, others: Indices) -> np.ndarray:

@@ -59,7 +59,7 @@ class LocalizerState:
     """All memory of a localizer, as it stands after a frame.
 
     `hypotheses`: poses held possible, the likeliest first; before the track is `confirmed` they may differ in their
-    assignments. `margin`: log odds of the assignment, from the frame that confirmed it, 0 where no single frame could.
+    assignments. `margin`: log odds that the array is where the track has it, the best of one frame; 0 where none told.
     `thin_frames`: frames in a row, up to the last that was checked, in which fewer than four lights held the track.
     `twin`: another array of the same layout was in view. `frozen`: the last frame was the picture before it again.
     `failures`: frames since the first hypothesis last held. `stage`: docking stage of the last fix. `last`: detections

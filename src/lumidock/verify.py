@@ -12,7 +12,7 @@ from lumidock._kernels.tracking.track import TWIST, PredictedMeasurements
 from lumidock.config import Config, IntegrityConfig, MatchConfig, TrackConfig
 from lumidock.datatypes import Array, Indices
 from lumidock.light_counts import CHECKED_LIGHTS, JOINT_TRACK_LIGHTS, POSE_LIGHTS
-from lumidock.match import Acquisition, conflicts
+from lumidock.match import Acquisition, alike, conflicts
 from lumidock.track import Track
 
 _REPEATED_SHARE = 0.7  # of the detections that must repeat
@@ -47,6 +47,11 @@ def is_answer(found: Acquisition, config: MatchConfig) -> bool:
     """Whether one frame alone decides its association: four lights or more, and nothing else fits nearly as well."""
     enough = bool(found.hypotheses) and found.hypotheses[0].n_assigned >= CHECKED_LIGHTS
     return enough and found.margin > config.margin
+
+
+def finds_array(found: Acquisition, assignment: Indices, config: MatchConfig) -> bool:
+    """Whether an acquisition finds the array where an association has it, one light assigned otherwise at most."""
+    return is_answer(found, config) and bool(alike(found.hypotheses[0].assignment, assignment[None])[0])
 
 
 def agrees(found: Acquisition, assignment: Indices, config: MatchConfig) -> bool:
@@ -107,15 +112,13 @@ def contradict(a: Indices, b: Indices) -> bool:
 
 
 def remaining_margin(track: Track, margin: float, config: IntegrityConfig) -> float:
-    """The margin of the frame that confirmed the track, capped where no frame agrees: alone it then proves nothing."""
-    return margin if track.agreeing_frames > 0 else min(margin, config.evidence)
+    """The margin of a track; where no frame agrees since a failed test another frame has to prove it again."""
+    return margin if track.agreeing_frames > 0 else min(margin, -math.log(config.risk))
 
 
 def is_proven(track: Track, margin: float, config: IntegrityConfig) -> bool:
-    """Whether the association meets the stated risk: by the evidence of one frame, or by successive frames that agree.
+    """Whether the association meets the stated risk: by the evidence of one frame, and no failed test since.
 
-    More frames have to agree where no single frame could decide (`margin` 0). After a failed test the margin is capped
-    (`remaining_margin`), so that agreeing frames are needed again.
+    Frames that only repeat an association prove nothing: a glint on the structure repeats as well as a lamp.
     """
-    carried = config.carried_frames if margin > 0.0 else config.gathered_frames
-    return track.agreeing_frames > 0 and (margin > config.evidence or track.agreeing_frames >= carried)
+    return track.agreeing_frames > 0 and margin > -math.log(config.risk)

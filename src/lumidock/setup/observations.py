@@ -18,7 +18,7 @@ from lumidock.station import Station
 LEAST_LIGHTS = 4  # three lights fit up to four poses, so a frame with fewer than four says nothing of positions
 Progress = Callable[[int, int | None], None]
 _SAME_PX = 1.0  # between a label and its detection: a run keeps hundredths, and lights stand apart by more
-_ANY_ROLL = 1e-6  # share of approaches with any roll, the least that `prior.any_roll` takes
+_ANY_ROLL = 1e-9  # share of approaches with any roll, the least that `prior.any_roll` takes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
