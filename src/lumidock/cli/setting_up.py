@@ -43,6 +43,16 @@ _LEAST_OF_A_COLOR = 4  # lights; of fewer the way they move together says too li
 _CHECK_SIGMA_M = 0.05  # how far a light may have moved since the survey and still be found
 
 
+LabelsOption = Annotated[
+    Path | None,
+    typer.Option(metavar="CSV", help="frame,u_px,v_px,light: detections of the first source that you identified."),
+]
+DistanceOption = Annotated[
+    list[str] | None,
+    typer.Option("--distance", metavar="A B M", help="Taped metres between two lights; may be repeated."),
+]
+
+
 class _SurveyCommand(TyperCommand):
     """A command whose `--distance` takes three words and may be repeated, which typer does not offer."""
 
@@ -86,15 +96,9 @@ def _survey(
         float | None,
         typer.Option(metavar="M", min=0.001, max=1.0, help="1 sigma of the drawing, each axis; else the file's own."),
     ] = None,
-    distances: Annotated[
-        list[str] | None,
-        typer.Option("--distance", metavar="A B M", help="Taped metres between two lights; may be repeated."),
-    ] = None,
+    distances: DistanceOption = None,
     distance_sigma: Annotated[float, typer.Option(metavar="M", min=1e-4, help="1 sigma of a taped distance.")] = 0.002,
-    labels: Annotated[
-        Path | None,
-        typer.Option(metavar="CSV", help="frame,u_px,v_px,light: detections of the first source that you identified."),
-    ] = None,
+    labels: LabelsOption = None,
     known: Annotated[
         list[str] | None, typer.Option("--known", metavar="LAYER", help="A layer that the file has right.")
     ] = None,
