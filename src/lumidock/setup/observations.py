@@ -106,7 +106,8 @@ def identify(
         found = [k for k, row in enumerate(rows[first:]) if row is not None]
         spans += found[-1] - found[0] + 1 if found else 0
     kept = [row for row in rows if row is not None]
-    return replace(_together(kept, len(station)), share=len(kept) / max(spans, 1))
+    together = _together(kept, len(station))
+    return replace(together, share=len(kept) / spans) if kept else together
 
 
 def labelled(
