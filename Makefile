@@ -20,6 +20,10 @@ demo: setup
 
 test: lint
 	@$(BIN)/lumidock warm  # or every worker would compile the same
+	@$(BIN)/python -m pytest -n auto --dist loadfile
+
+# the same tests, and which lines they reach
+coverage: setup
 	@$(BIN)/python -m pytest -n auto --dist loadfile --cov --cov-report=term
 
 slow: setup
