@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -48,6 +49,13 @@ def why_no_root():
     return "" if subprocess.run(probe, capture_output=True).returncode == 0 else "this machine lets nobody mount"
 
 
+def stop(process):
+    """End in good order what a stage's command line has started; `unshare` itself ignores the signal."""
+    (child,) = map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split())
+    os.kill(child, signal.SIGTERM)
+    process.wait(60)
+
+
 class Stage:
     """One stage of an image: its folder, and what its instructions have set."""
 
@@ -83,7 +91,7 @@ class Stage:
             f"--chdir={self.workdir}",
         ]
         settings = [f"{name}={value}" for name, value in self.env.items()]
-        shell = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "sh", "-c", MOUNTS, "sh", str(self.folder)]
+        shell = ["unshare", "--mount", "--pid", "--fork", "sh", "-c", MOUNTS, "sh", str(self.folder)]
         return [*shell, sys.base_prefix, *inside, *settings, *words]
 
     def run(self, words, timeout=900):

@@ -9,7 +9,7 @@ import time
 
 import pytest
 import tomllib
-from dockerfile import ROOT, carried_out, instructions, why_no_root
+from dockerfile import ROOT, carried_out, instructions, stop, why_no_root
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 NO_FILES = re.compile(r"dock\.yaml")  # what the image says when nobody has given it a dock
@@ -135,8 +135,8 @@ def test_its_steps_run_in_a_root_file_system_of_its_own(tmp_path):
         assert re.match(r"console at http://0\.0\.0\.0:8780/#token=", server.stdout.readline())
         image.run(image.said["HEALTHCHECK"])
     finally:
-        server.terminate()
-        server.wait(30)
+        stop(server)
+    assert server.returncode == 0
     image.run(["lumidock", "run", "a", "--out", "b"])
     assert compiled(tmp_path) == before
 
