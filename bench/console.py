@@ -81,7 +81,7 @@ def _exactly(page: socket.socket, count: int) -> bytes:
 @contextmanager
 def pages(port: int) -> Iterator[None]:
     """Two pages that draw and one that has stalled, in a process of their own."""
-    viewer = subprocess.Popen([sys.executable, "-m", "bench.console", str(port)])
+    viewer = subprocess.Popen([sys.executable, "-m", "bench.console", str(port)], stdin=subprocess.PIPE)
     try:
         yield
     finally:
@@ -90,7 +90,7 @@ def pages(port: int) -> Iterator[None]:
 
 
 def look_on(port: int) -> None:
-    """Be these three pages, until ended."""
+    """Be these three pages until ended, or until whoever started them is gone."""
     stalled = open_socket(port)
     for _ in range(50):
         ask(stalled, 0)
@@ -103,7 +103,14 @@ def look_on(port: int) -> None:
 
     for _ in range(2):
         threading.Thread(target=draw, daemon=True).start()
-    time.sleep(10 * _TURN_S)
+    sys.stdin.read()
+
+
+def simulate(sequence: Path) -> None:
+    """Three seconds of an approach, in pictures of five megapixels."""
+    command = [sys.executable, "-m", "lumidock", "sim", "approach", "--out", str(sequence)]
+    command += [word for setting in _SETTINGS for word in ("--set", setting)]
+    subprocess.run(command, check=True, capture_output=True)
 
 
 def turn(folder: Path, *, with_pages: bool) -> float:
@@ -133,9 +140,7 @@ def main() -> tuple[dict[str, object], list[str]]:
     with TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "vehicle.yaml").write_text(_VEHICLE)
-        command = [sys.executable, "-m", "lumidock", "sim", "approach", "--out", str(folder / "sequence")]
-        command += [word for setting in _SETTINGS for word in ("--set", setting)]
-        subprocess.run(command, check=True, capture_output=True)
+        simulate(folder / "sequence")
         for number in range(2 * _ROUNDS):
             with_pages = number % 4 in (1, 2)  # none, three, three, none, ...: a drift of the machine hits both
             delays[with_pages].append(turn(folder, with_pages=with_pages))

@@ -37,16 +37,37 @@ def simulate(folder: Path) -> Path:
 
 
 @contextmanager
-def address_of(*words: object) -> Iterator[str]:
-    """A command of lumidock that serves the console, and the address that it prints."""
+def started(*words: object) -> Iterator[tuple[str, int]]:
+    """A command of lumidock that serves the console: the address that it prints, and the number of its process."""
     command = [sys.executable, "-m", "lumidock", *map(str, words)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
-        yield process.stdout.readline().split()[-1]
+        yield process.stdout.readline().split()[-1], process.pid
     finally:
         process.terminate()
         process.wait(30)
+
+
+@contextmanager
+def address_of(*words: object) -> Iterator[str]:
+    """The address of such a command alone."""
+    with started(*words) as (address, _):
+        yield address
+
+
+@contextmanager
+def chromium(asking: str) -> Iterator[Browser]:
+    """A browser without a screen. Raises: SystemExit where there is none."""
+    from playwright.sync_api import sync_playwright  # here, so that the other benches run without it
+
+    path = shutil.which("chromium")
+    if path is None:
+        raise SystemExit(f"{asking}: needs chromium; Debian has it as a package")
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield browser
+        browser.close()
 
 
 def opened(browser: Browser, address: str, size: tuple[int, int], scheme: str) -> Page:
@@ -85,6 +106,12 @@ def replay(browser: Browser, sequence: Path) -> list[str]:
         page.emulate_media(color_scheme="dark")
         page.get_by_role("button", name="Zoom to lights").first.click()
         lines.append(shoot(page, "compare"))
+        page.emulate_media(color_scheme="light")
+        page.get_by_role("tab", name="Survey").click()
+        page.get_by_role("button", name="Show three frames").click()
+        page.locator("#panel-survey .mark.front").nth(2).click(force=True)  # its label is asked for
+        page.get_by_text("every light carries its own id").first.wait_for()
+        lines.append(shoot(page, "survey"))
     return lines
 
 
@@ -102,14 +129,7 @@ def live(browser: Browser, sequence: Path) -> list[str]:
 
 def main() -> tuple[dict[str, object], list[str]]:
     """Simulate, open and write them. Raises: SystemExit where there is no Chromium."""
-    from playwright.sync_api import sync_playwright  # here, so that the other benches run without it
-
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        raise SystemExit("console-pictures: needs chromium; Debian has it as a package")
-    with TemporaryDirectory() as folder, sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+    with TemporaryDirectory() as folder, chromium("console-pictures") as browser:
         sequence = simulate(Path(folder))
         lines = [*live(browser, sequence), *replay(browser, sequence)]
-        browser.close()
     return {"pictures": lines}, lines

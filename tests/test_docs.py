@@ -11,6 +11,7 @@ from urllib.parse import unquote
 import pytest
 import tomllib
 from bench.__main__ import BENCHES, between_marks
+from bench.commands import main as commands_of_the_code
 from bench.configuration import main as configuration
 from bench.shipped import CAMERA_FILE, STATION_FILE
 from commandline import LUMIDOCK
@@ -21,7 +22,7 @@ PAGES = [README, *sorted((ROOT / "docs").glob("*.md")), ROOT / "CONTRIBUTING.md"
 MAX_README_LINES = 160
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SHORT = "--set path.start_z_m=9.5 --set path.end_z_m=8.3 --set path.frame_interval_s=0.2"
-LONG = re.compile(r"lumidock (demo|reproduce)\b")  # minutes: run by the tests that are marked slow
+LONG = re.compile(r"lumidock (demo|reproduce|warm)\b")  # minutes: run by the tests that are marked slow
 
 
 def blocks(page, language):
@@ -68,6 +69,31 @@ def test_configuration_page_is_what_the_code_says():
     assert between_marks("configuration").search(page)[0].splitlines()[2:-2] == lines, (
         "make it anew: python -m bench configuration --docs"
     )
+
+
+def test_commands_page_is_what_the_code_says():
+    page = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
+    _, lines = commands_of_the_code()
+    assert between_marks("commands").search(page)[0].splitlines()[2:-2] == lines, (
+        "make it anew: python -m bench commands --docs"
+    )
+
+
+def test_every_option_that_a_page_names_exists():
+    known = set(re.findall(r"--[a-z][a-z0-9-]+", (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")))
+    for page in PAGES:
+        for line in re.findall(
+            r"^ *(lumidock .*)$", page.read_text(encoding="utf-8").replace("\\\n", " "), re.MULTILINE
+        ):
+            assert set(re.findall(r"(?<= )--[a-z][a-z0-9-]+", line)) <= known | {"--help", "--version"}, (
+                page.name,
+                line,
+            )
+
+
+def test_the_site_has_every_page():
+    listed = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
+    assert listed == {page.name for page in (ROOT / "docs").glob("*.md")}
 
 
 def test_every_table_has_a_bench_and_is_filled():
@@ -153,13 +179,19 @@ def test_every_command_of_the_guide_runs(desk, approach):
     run_page(ROOT / "docs" / "guide.md", desk)
 
 
-@pytest.mark.parametrize("name", ["configuration.md", "simulator.md", "simulator-physics.md", "closed-loop.md"])
+OTHERS = {
+    *("configuration.md", "simulator.md", "simulator-physics.md", "closed-loop.md"),
+    *("start.md", "bluerov2.md", "ros-bags.md", "research.md"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(OTHERS))
 def test_every_command_of_the_other_pages_runs(desk, name):
     run_page(ROOT / "docs" / name, desk)
 
 
 def test_no_other_page_has_commands():
-    run = {"README.md", "guide.md", "configuration.md", "simulator.md", "simulator-physics.md", "closed-loop.md"}
+    run = {"README.md", "guide.md", *OTHERS}
     assert {page.name for page in PAGES if commands(page)} <= run
 
 

@@ -6,19 +6,19 @@ import socket
 import pytest
 
 from lumidock.streams.healthpage import HealthPage
-from lumidock.streams.localweb import is_answered
+from lumidock.streams.localweb import is_known_host, is_own_origin
 
 HERE = ["127.0.0.1:8780", "localhost:8780", "[::1]:8780", "LOCALHOST", "127.0.0.1"]
-ELSEWHERE = ["evil.example", "evil.example:8780", "localhost.evil.example:8780", "127.0.0.1.evil.example", "", None]
+ELSEWHERE = ["evil.example", "evil.example:8780", "localhost.evil.example:8780", "127.0.0.1.evil.example", ""]
 
 
 @pytest.mark.parametrize("listening", ["127.0.0.1", "::1", "localhost", "0.0.0.0", "192.168.2.1"])
 def test_hosts(listening):
-    assert all(is_answered(listening, host, None) for host in HERE)
-    assert not any(is_answered(listening, host, None) for host in ELSEWHERE)
+    assert all(is_known_host(listening, host) for host in HERE)
+    assert not any(is_known_host(listening, host) for host in ELSEWHERE)
     on_the_network = listening in ("0.0.0.0", "192.168.2.1")
     for host in ("192.168.2.1:8780", "10.0.0.5", f"{socket.gethostname()}:8780"):
-        assert is_answered(listening, host, None) == on_the_network
+        assert is_known_host(listening, host) == on_the_network
 
 
 @pytest.mark.parametrize(
@@ -29,12 +29,13 @@ def test_hosts(listening):
         ("http://127.0.0.1:9999", False),
         ("http://localhost:8780", False),
         ("https://evil.example", False),
+        (None, True),
         ("null", False),
         ("", False),
     ],
 )
 def test_origins(origin, answered):
-    assert is_answered("127.0.0.1", "127.0.0.1:8780", origin) == answered
+    assert is_own_origin("127.0.0.1:8780", origin) == answered
 
 
 @pytest.mark.parametrize(

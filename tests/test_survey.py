@@ -22,7 +22,7 @@ from lumidock.setup.advice import helpful_views
 from lumidock.setup.bundle import CALIBRATION, Distance, Estimate, Prior
 from lumidock.setup.gauge import aligned, scale_sigma, shape_covariance, similarity_generators
 from lumidock.setup.moved import moves
-from lumidock.setup.observations import Observations
+from lumidock.setup.observations import Labelled, Observations, identify
 from lumidock.setup.station_files import write_surveyed
 from lumidock.setup.survey import Survey, prior_of, survey
 from lumidock.station import load_station
@@ -209,6 +209,45 @@ def test_a_light_that_moved_since_is_found(found: Survey, dock: BuiltDock):
     compared = moves(later, found.sigma_m)
     assert [filed.ids[i] for i in np.flatnonzero(compared.moved)] == ["F5"]
     assert compared.by_m[filed.ids.index("F5"), 1] == pytest.approx(-0.06, abs=0.01)
+
+
+def _labels(dock: BuiltDock, places: tuple[int, ...]) -> list[Labelled]:
+    """What a person who knows the lights says of some frames of the first recording."""
+    shown = [(dock.recordings[0][k], dock.lights[0][k]) for k in places]
+    return [Labelled(d.frame, tuple(d.uv[i]), int(light[i])) for d, light in shown for i in np.flatnonzero(light >= 0)]
+
+
+def test_labels_of_three_frames_bring_in_a_light_that_is_drawn_far_off(dock: BuiltDock):
+    far = dock.drawing.ids.index("F5")
+    p = dock.drawing.p_dock.copy()
+    p[far, 0] += 0.4  # eight of the sigmas that are stated
+    drawing, one = replace(dock.drawing, p_dock=p), [dock.recordings[0][::2]]
+    prior = prior_of(drawing, distances=(Distance(*taped(dock, "F1", "R5"), 0.002),))
+    count = len(one[0])
+    labels = _labels(dock, tuple(2 * k for k in (count // 2, 2 * count // 3, 5 * count // 6)))
+    assert identify(one, drawing, dock.camera, Config()).seen[:, far].mean() < 0.1
+    told = survey(one, drawing, dock.camera, Config(), prior, labels=labels)
+    error = shape_error(told.after.p_dock, dock.built.p_dock, told.adjusted.seen, scale=False)[far]
+    assert told.observed.seen[:, far].mean() > 0.5
+    assert np.linalg.norm(error) < 0.02
+    frame = told.observed.frame.index(labels[-1].frame)
+    assert set(np.flatnonzero(told.observed.seen[frame])) <= {
+        label.light for label in labels if label.frame == labels[-1].frame
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda labels: [replace(labels[0], frame="nowhere")], "frame nowhere: labelled, but not in the recording"),
+        (lambda labels: [replace(labels[0], uv=(-50.0, 3.0)), *labels[1:]], "no detection at -50.0, 3.0 px"),
+        (lambda labels: labels[:3], "3 lights labelled, wanted at least 4"),
+    ],
+)
+def test_labels_of_what_is_not_there_are_refused(dock: BuiltDock, change, why: str):
+    labels = _labels(dock, (len(dock.recordings[0]) // 2,))
+    with pytest.raises(InputError, match=why):
+        survey(dock.recordings[:1], dock.drawing, dock.camera, Config(), prior_of(dock.drawing), labels=change(labels))
 
 
 def test_footage_of_another_dock_is_refused(dock: BuiltDock):

@@ -43,6 +43,7 @@ from lumidock.errors import InputError, extra
 from lumidock.methods import localizer_of, require_method
 from lumidock.station import Station, load_station
 from lumidock.streams.healthpage import HealthPage
+from lumidock.streams.localweb import is_loopback
 from lumidock.streams.source import Reading
 from lumidock.yamlfile import validate
 
@@ -67,8 +68,6 @@ def wants_console(asked: bool | None, host: str) -> bool:
         with extra("console"):
             from lumidock.app.console import server  # noqa: F401  # only whether it can be imported
         return True
-    from lumidock.app.console.guard import is_loopback
-
     return asked is None and is_loopback(host) and _installed()
 
 

@@ -31,14 +31,26 @@ from lumidock.config import Config, load_config
 from lumidock.datatypes import Detections
 from lumidock.errors import InputError
 from lumidock.station import Station, load_station
+from lumidock.streams.folder import read_csv
 from lumidock.streams.source import Reading
 
 if TYPE_CHECKING:
     from lumidock.setup.bundle import Distance
+    from lumidock.setup.observations import Labelled
     from lumidock.setup.survey import Survey
 
 _LEAST_OF_A_COLOR = 4  # lights; of fewer the way they move together says too little
 _CHECK_SIGMA_M = 0.05  # how far a light may have moved since the survey and still be found
+
+
+LabelsOption = Annotated[
+    Path | None,
+    typer.Option(metavar="CSV", help="frame,u_px,v_px,light: detections of the first source that you identified."),
+]
+DistanceOption = Annotated[
+    list[str] | None,
+    typer.Option("--distance", metavar="A B M", help="Taped metres between two lights; may be repeated."),
+]
 
 
 class _SurveyCommand(TyperCommand):
@@ -84,11 +96,9 @@ def _survey(
         float | None,
         typer.Option(metavar="M", min=0.001, max=1.0, help="1 sigma of the drawing, each axis; else the file's own."),
     ] = None,
-    distances: Annotated[
-        list[str] | None,
-        typer.Option("--distance", metavar="A B M", help="Taped metres between two lights; may be repeated."),
-    ] = None,
+    distances: DistanceOption = None,
     distance_sigma: Annotated[float, typer.Option(metavar="M", min=1e-4, help="1 sigma of a taped distance.")] = 0.002,
+    labels: LabelsOption = None,
     known: Annotated[
         list[str] | None, typer.Option("--known", metavar="LAYER", help="A layer that the file has right.")
     ] = None,
@@ -115,9 +125,10 @@ def _survey(
     drawing, sigma_m = load_station(path), _CHECK_SIGMA_M if check else off
     tapes = [_distance(text, drawing, distance_sigma) for text in distances or ()]
     prior = prior_of(drawing, sigma_m=sigma_m, known=known or (), distances=tapes)
+    told = _labels(labels, drawing) if labels else []
     with progress_bar("survey") as progress:
         lens, recordings = _recordings(sources, drawing, camera, (settings, fps))
-        found = survey(recordings, drawing, lens, settings, prior, progress=progress)
+        found = survey(recordings, drawing, lens, settings, prior, progress=progress, labels=told)
     if out is not None and not found.refusal:
         _write(found, path, out)
     if page is not None:
@@ -181,6 +192,26 @@ def _distance(text: str, drawing: Station, sigma_m: float) -> Distance:
     if len(words) != 3 or a == b or not (math.isfinite(metres) and metres > 0.0):
         raise InputError(f"--distance {text}: wanted two lights and a positive number of metres")
     return Distance(drawing.ids.index(a), drawing.ids.index(b), metres, sigma_m)
+
+
+def _labels(path: Path, drawing: Station) -> list[Labelled]:
+    """The labels in a file. Raises: InputError for a light that there is not, or that a frame has twice."""
+    from lumidock.setup.observations import Labelled
+
+    found = list[Labelled]()
+    for row in read_csv(path, ("frame", "u_px", "v_px", "light")):
+        where = f"{path}: frame {row['frame']}"
+        if row["light"] not in drawing.ids:
+            raise InputError(f"{where}: no light {row['light']} in {drawing.name}")
+        try:
+            uv = float(row["u_px"]), float(row["v_px"])
+        except ValueError as error:
+            raise InputError(f"{where}: {error}") from None
+        label = Labelled(row["frame"], uv, drawing.ids.index(row["light"]))
+        if any((other.frame, other.light) == (label.frame, label.light) for other in found):
+            raise InputError(f"{where}: light {row['light']} is given twice")
+        found.append(label)
+    return found
 
 
 def _recordings(

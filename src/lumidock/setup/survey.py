@@ -20,7 +20,7 @@ from lumidock.pose import sqpnp
 from lumidock.setup import bundle
 from lumidock.setup.bundle import CALIBRATION, Adjusted, Distance, Estimate, Prior
 from lumidock.setup.gauge import scale_sigma, shape_covariance
-from lumidock.setup.observations import LEAST_LIGHTS, Observations, Progress, identify
+from lumidock.setup.observations import LEAST_LIGHTS, Labelled, Observations, Progress, identify, labelled
 from lumidock.station import Station
 
 _ROUNDS = 5  # of association and adjustment; a drawing 10 cm off settles in three
@@ -71,23 +71,25 @@ def survey(
     prior: Prior,
     *,
     progress: Progress | None = None,
+    labels: Sequence[Labelled] = (),
 ) -> Survey:
     """Survey a dock from the detections of `recordings`, which are gone through several times.
 
-    Raises: InputError where hardly any frame has lights that can be associated.
+    `labels` are detections that a person has identified: the frames that they tell of are taken as they say, and what
+    these frames alone say of the lights is where the association of the others begins.
+    Raises: InputError where hardly any frame has lights that can be associated, and for labels of what is not there.
     """
-    station, sigma, estimate, rounds = drawing, prior.sigma_m, None, 0
+    estimate, rounds = None, 0
     lists = [list(recording) for recording in recordings]
+    station, sigma = _told(labelled(lists, drawing, labels, config.match.noise_px), drawing, camera, prior)
     while True:
-        observed = identify(lists, _declared(station, sigma), camera, config, progress)
+        observed = identify(lists, _declared(station, sigma), camera, config, progress, labels=labels)
         observed, poses = _usable(observed, camera, station.p_dock, sigma)
         calibration = estimate.calibration if estimate else np.zeros(CALIBRATION)
         adjusted = bundle.adjust(observed, camera, prior, Estimate(station.p_dock, poses, calibration))
         moved = np.abs(adjusted.estimate.p_dock - station.p_dock)
         estimate = adjusted.estimate
-        covariance = shape_covariance(adjusted.covariance, estimate.p_dock, adjusted.seen)
-        station = replace(station, p_dock=estimate.p_dock)
-        sigma = np.maximum(np.sqrt(np.diagonal(covariance)).reshape(-1, 3), _LEAST_SIGMA_M)
+        station, sigma = replace(station, p_dock=estimate.p_dock), _sigma_of(adjusted)
         rounds += 1
         if rounds == _ROUNDS or (moved < _SETTLED * sigma + 1e-4).all():
             return _conclude(drawing, camera, prior, observed, adjusted, rounds)
@@ -116,6 +118,22 @@ def prior_of(
         drawing.sigma_center_px,
         distances=tuple(distances),
     )
+
+
+def _told(observed: Observations, drawing: Station, camera: Camera, prior: Prior) -> tuple[Station, Array]:
+    """The drawing and its sigmas (M, 3) after the frames that a person has labelled, where there are any."""
+    poses, found = clear_poses(observed, camera, prior.p_dock, prior.sigma_m)
+    if not found.any():
+        return drawing, prior.sigma_m
+    at = Estimate(prior.p_dock, poses[found], np.zeros(CALIBRATION))
+    adjusted = bundle.adjust(observed.take(np.flatnonzero(found)), camera, prior, at)
+    return replace(drawing, p_dock=adjusted.estimate.p_dock), _sigma_of(adjusted)
+
+
+def _sigma_of(adjusted: Adjusted) -> Array:
+    """The 1-sigma error (M, 3) of each light."""
+    covariance = shape_covariance(adjusted.covariance, adjusted.estimate.p_dock, adjusted.seen)
+    return np.maximum(np.sqrt(np.diagonal(covariance)).reshape(-1, 3), _LEAST_SIGMA_M)
 
 
 def _declared(station: Station, sigma_m: Array) -> Station:
@@ -212,8 +230,7 @@ def _conclude(
 ) -> Survey:
     estimate = adjusted.estimate
     covariance = shape_covariance(adjusted.covariance, estimate.p_dock, adjusted.seen)
-    sigma = np.maximum(np.sqrt(np.diagonal(covariance)).reshape(-1, 3), _LEAST_SIGMA_M)
-    seen = adjusted.seen
+    sigma, seen = _sigma_of(adjusted), adjusted.seen
     scale = scale_sigma(adjusted.covariance, estimate.p_dock, seen)
     scale_before = scale_sigma(np.diag(prior.sigma_m.ravel() ** 2), prior.p_dock, seen)
     held_out = _held_out(observed, camera, prior, adjusted)

@@ -10,7 +10,7 @@ from functools import partial
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Any
 
-from lumidock.streams.localweb import is_answered
+from lumidock.streams.localweb import is_known_host, is_own_origin
 
 _TIMEOUT_S = 2.0  # a client may take over one request
 
@@ -55,7 +55,8 @@ class _Handler(BaseHTTPRequestHandler):
             limit.cancel()
 
     def do_GET(self) -> None:  # the name that http.server calls
-        if not is_answered(self._listening, self.headers.get("Host"), self.headers.get("Origin")):
+        host = self.headers.get("Host") or ""
+        if not (is_known_host(self._listening, host) and is_own_origin(host, self.headers.get("Origin"))):
             self.send_error(403)
             return
         if self.path not in ("/", "/health.json"):

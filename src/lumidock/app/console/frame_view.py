@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lumidock.app.console.limits import limits_view
 from lumidock.app.reasons import explain
 from lumidock.camera import Camera
 from lumidock.datatypes import Array, Fix, Match
@@ -39,7 +40,7 @@ def scene_view(scene: Scene) -> dict[str, Any]:
         "width": camera.width,
         "height": camera.height,
         "docking_point": _numbers(station.docking_point),
-        "limits": station.alert_limits.as_text().split("; "),
+        "limits": limits_view(station.alert_limits),
         "layers": list(station.layers_front_to_rear()),
         "lights": [
             {"id": station.ids[i], "layer": station.layers[station.layer[i]], "p_dock": _numbers(station.p_dock[i])}

@@ -8,13 +8,13 @@ header, a request of another site's page by the Origin header. Written against t
 from __future__ import annotations
 
 import hmac
-import ipaddress
 import json
 import secrets
-import socket
 from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass
 from typing import Any
+
+from lumidock.streams.localweb import is_known_host, is_loopback, is_own_origin
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
@@ -42,14 +42,6 @@ _HEADERS = (
 def new_token() -> str:
     """A token that nobody can guess: 128 bits."""
     return secrets.token_urlsafe(16)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address to listen on is this machine's own."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,11 +74,11 @@ class Guard:
         if scope["type"] not in ("http", "websocket"):
             return Refusal(400, "neither HTTP nor a WebSocket")
         host = headers.get(b"host", b"").decode("latin-1")
-        if not self._knows(host):
+        if not is_known_host(self._host, host):
             return Refusal(421, f"no console is known by the name {host[:80]!r}; open it by its address")
-        origin = headers.get(b"origin", b"").decode("latin-1")
-        if origin and origin.partition("://")[2].lower() != host.lower():
-            return Refusal(403, f"the page of {origin[:80]!r} may not use this console")
+        origin = headers[b"origin"].decode("latin-1") if b"origin" in headers else None
+        if not is_own_origin(host, origin):
+            return Refusal(403, f"the page of {str(origin)[:80]!r} may not use this console")
         reading = scope["type"] == "websocket" or scope["method"] in _READING
         length = headers.get(b"content-length", b"0" if reading else b"")
         if not length.isdigit():
@@ -98,18 +90,6 @@ class Guard:
             return Refusal(401, "wanted the token; open the address with #token= that the command printed")
         return None
 
-    def _knows(self, host: str) -> bool:
-        """Whether a Host header is an address, or a name of this machine; other names may be anybody's."""
-        name = _without_port(host)
-        if name in ("localhost", self._host):
-            return True
-        try:
-            address = ipaddress.ip_address(name)
-        except ValueError:
-            own = socket.gethostname().lower()
-            return not self._private and name in (own, f"{own}.local")
-        return address.is_loopback if self._private else True
-
     def _has_token(self, scope: Message, headers: dict[bytes, bytes]) -> bool:
         if scope["type"] == "websocket":
             offered = [name for name in scope.get("subprotocols", ()) if name.startswith(_TOKEN_PREFIX)]
@@ -117,13 +97,6 @@ class Guard:
         else:
             given = headers.get(b"authorization", b"").decode("latin-1").removeprefix("Bearer ")
         return hmac.compare_digest(given.encode(), self._token.encode())
-
-
-def _without_port(host: str) -> str:
-    """The name or address in a Host header; an IPv6 address stands in brackets."""
-    if host.startswith("["):
-        return host[1:].partition("]")[0] if "]" in host else ""
-    return host.partition(":")[0].lower()
 
 
 def _with_headers(send: Send) -> Send:

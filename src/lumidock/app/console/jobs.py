@@ -109,8 +109,10 @@ def _run(job: Job, work: Work) -> None:
     try:
         job.result = work(job)
         job.state = "done"
-    except (LumidockError, OSError, ValueError) as error:
-        job.line, job.state = " ".join(str(error).split()), "failed"
+    except Exception as error:  # whatever it is: a page waits for the end of the job
+        expected = isinstance(error, LumidockError | OSError | ValueError)
+        job.line = " ".join((str(error) if expected else repr(error)).split())
+        job.state = "failed"
 
 
 def _lower_priority() -> None:

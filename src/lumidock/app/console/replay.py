@@ -13,9 +13,11 @@ from typing import Any
 
 from lumidock.app.console.frame_view import Scene, frame_view, trust
 from lumidock.app.console.jobs import Job, Jobs
+from lumidock.app.console.limits import Choice
 from lumidock.app.console.live import picture_of
 from lumidock.app.console.stretch import pack, require_stretch, stretch_of, write_stretch
 from lumidock.app.console.tuning import profile_text
+from lumidock.app.console.wizards import Files
 from lumidock.app.run import Setup, run
 from lumidock.camera import save_camera
 from lumidock.config import Config
@@ -23,6 +25,7 @@ from lumidock.datatypes import Fix, Frame, Unusable
 from lumidock.errors import InputError, LumidockError
 from lumidock.methods import Method, require_method
 from lumidock.picture import developed
+from lumidock.station import load_station
 from lumidock.streams.replay import read_fixes
 from lumidock.streams.run_folder import RunFolder
 from lumidock.streams.source import Item, Source
@@ -40,7 +43,7 @@ class Variant:
     number: int
     label: str
     method: str
-    config: Config
+    choice: Choice
     first: int = 0
     rows: list[Row] = field(default_factory=list)
 
@@ -113,7 +116,8 @@ class Replay:
         self.problem, self.ended = "", False
         self._jobs, self._scratch, self._localizer = jobs, scratch, localizer
         self._lock, self._halt, self._numbers = threading.Lock(), threading.Event(), count(1)
-        base = Variant(0, f"as recorded: {recording.method}", recording.method, recording.config)
+        files = Files(recording.station, recording.camera, scratch)
+        base = Variant(0, f"as recorded: {recording.method}", recording.method, Choice(recording.config, files))
         self._variants, self._places = {0: base}, list[tuple[int, int]]()
         self._pictures = tempfile.TemporaryFile(dir=scratch)  # noqa: SIM115  # closed with the replay
         self._thread = threading.Thread(target=self._read, name="replay", daemon=True)
@@ -214,8 +218,11 @@ class Replay:
             if row is None:
                 return None
             fix, latency_us = row
-            last_seen = self._last_seen(self._variants[number], index, fix.t_ns)
-        return frame_view(fix, self.recording.scene, latency_us) | {"index": index, "last_seen_s": last_seen}
+            variant, scene = self._variants[number], self.recording.scene
+            last_seen = self._last_seen(variant, index, fix.t_ns)
+        if variant.choice.files.station != self.recording.station:
+            scene = Scene(load_station(variant.choice.files.station), scene.camera)
+        return frame_view(fix, scene, latency_us) | {"index": index, "last_seen_s": last_seen}
 
     def _last_seen(self, variant: Variant, index: int, now_ns: int) -> dict[str, float]:
         """Seconds since each light was last identified, up to this frame."""
@@ -234,7 +241,7 @@ class Replay:
             raise InputError(f"no variant {number}")
         return self._variants[number]
 
-    def rerun(self, method: str, config: Config, label: str, stretch: tuple[int, int] | None) -> Job:
+    def rerun(self, method: str, choice: Choice, label: str, stretch: tuple[int, int] | None) -> Job:
         """Run the recording, or a stretch of it, with another method or other settings; the job gives the variant.
 
         A run whose frames are not at hand is repeated from its detections. Raises: InputError for a method that there
@@ -246,24 +253,24 @@ class Replay:
         with self._lock:
             if len(self._variants) > _MOST_VARIANTS:
                 raise InputError(f"{_MOST_VARIANTS} variants are shown already; open the console anew")
-        return self._jobs.start(label, lambda job: self._rerun(job, method, config, label, stretch))
+        return self._jobs.start(label, lambda job: self._rerun(job, method, choice, label, stretch))
 
     def _rerun(
-        self, job: Job, method: str, config: Config, label: str, stretch: tuple[int, int] | None
+        self, job: Job, method: str, choice: Choice, label: str, stretch: tuple[int, int] | None
     ) -> dict[str, Any]:
         number = next(self._numbers)
         folder = self._scratch / f"variant-{number}"
         folder.mkdir()
-        self._run_command(job, folder, method, config, stretch)
+        self._run_command(job, folder, method, choice, stretch)
         ids = self.recording.scene.station.ids
         rows = [(fix, us) for fix, _, us in read_fixes(folder / "run", ids)]
-        variant = Variant(number, label, method, config, stretch[0] if stretch else 0, rows)
+        variant = Variant(number, label, method, choice, stretch[0] if stretch else 0, rows)
         with self._lock:
             self._variants[number] = variant
         return {"variant": number}
 
     def _run_command(
-        self, job: Job, folder: Path, method: str, config: Config, stretch: tuple[int, int] | None
+        self, job: Job, folder: Path, method: str, choice: Choice, stretch: tuple[int, int] | None
     ) -> None:
         """`lumidock run` over the source, or over a stretch of it that is written into `folder`."""
         it, options = self.recording, self.recording.options
@@ -273,8 +280,17 @@ class Replay:
             path, options = folder / "sequence", ()
             self._write_stretch(stretch, path)
         settings = folder / "config.yaml"
-        settings.write_text(profile_text(config, "of a comparison"), encoding="utf-8")
-        words = ("--station", it.station, "--camera", it.camera, "--method", method, "--config", settings)
+        settings.write_text(profile_text(choice.config, "of a comparison"), encoding="utf-8")
+        words = (
+            "--station",
+            choice.files.station,
+            "--camera",
+            choice.files.camera,
+            "--method",
+            method,
+            "--config",
+            settings,
+        )
         job.command(["run", str(path), *map(str, words), *options, "--out", str(folder / "run"), "--json"])
 
     def _write_stretch(self, stretch: tuple[int, int] | None, folder: Path) -> None:
@@ -308,16 +324,16 @@ class Replay:
         folder = Path(tempfile.mkdtemp(prefix="bundle-", dir=self._scratch))
         content, it = folder / "content", self.recording
         self._write_stretch(stretch, content / "sequence")
-        shutil.copyfile(it.station, content / "sequence" / "station.yaml")
+        shutil.copyfile(variant.choice.files.station, content / "sequence" / "station.yaml")
         save_camera(it.scene.camera, content / "sequence" / "camera.yaml")
         with RunFolder(content / "run", it.scene.station.ids) as rows:
             for index in range(stretch[0], stretch[1] + 1):
                 row = variant.at(index)
                 if row is not None:
                     rows.add(*row, t_ns=row[0].t_ns)
-            rows.describe({"method": variant.method, "config": variant.config.model_dump(mode="json")})
+            rows.describe({"method": variant.method, "config": variant.choice.config.model_dump(mode="json")})
         about = {"method": variant.method, "frames": list(stretch), "bookmarks": bookmarks, "notes": notes}
-        pack(content, folder / "bundle.zip", profile_text(variant.config, variant.label), about)
+        pack(content, folder / "bundle.zip", profile_text(variant.choice.config, variant.label), about)
         del job
         return {"file": str(folder / "bundle.zip")}
 

@@ -22,6 +22,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from lumidock.app.console.frame_view import scene_view
 from lumidock.app.console.guard import SUBPROTOCOL
 from lumidock.app.console.jobs import Jobs
+from lumidock.app.console.limits import Choice, files_with
 from lumidock.app.console.live import RATE_HZ, LiveView
 from lumidock.app.console.preview import preview
 from lumidock.app.console.replay import Replay
@@ -36,6 +37,9 @@ _KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".
 _MOST_PAGES = 8  # that look on at once
 _STALLED_S = 30.0  # until a page that neither asks nor reads gives its place to others
 _LOOK_S = 0.5  # within which the board is searched for once: it takes a processor 50 to 200 ms
+
+
+Body = dict[str, Any]
 
 
 @dataclass(slots=True)
@@ -73,6 +77,10 @@ class Console:
             raise InputError("a live camera is shown, no recording")
         return self.replay
 
+    def choice(self, body: Body) -> Choice:
+        """The settings and files of a request. Raises: InputError for settings or alert limits that there cannot be."""
+        return Choice(changed(self.config, body.get("settings", {})), files_with(self.files, body.get("limits")))
+
     def close(self) -> None:
         """End all that runs."""
         self.jobs.close()
@@ -81,7 +89,6 @@ class Console:
 
 
 Answer = Callable[[Request], Awaitable[Response]]
-Body = dict[str, Any]
 
 
 def application(console: Console) -> Starlette:
@@ -90,6 +97,7 @@ def application(console: Console) -> Starlette:
     reading = {
         "/": _page("index.html"),
         "/health.json": of.health,
+        "/register_service": of.service,
         "/api/about": of.about,
         "/api/settings": of.settings,
         "/api/recording": of.recording,
@@ -112,6 +120,7 @@ def application(console: Console) -> Starlette:
         "/api/board/solve": of.board_solve,
         "/api/survey": of.survey,
         "/api/save": of.save,
+        "/api/limits/save": of.limits_save,
     }
     return Starlette(
         routes=[
@@ -176,6 +185,21 @@ class _Api:
     async def health(self, _request: Request) -> Response:
         return JSONResponse(self._console.health())
 
+    async def service(self, _request: Request) -> Response:
+        """What BlueOS asks every port for, to list its services."""
+        return JSONResponse(
+            {
+                "name": "lumidock",
+                "description": "Where the vehicle is relative to its dock",
+                "icon": "mdi-lighthouse",
+                "company": "lumidock",
+                "version": version("lumidock"),
+                "webpage": "",
+                "api": "/health.json",
+                "new_page": True,
+            }
+        )
+
     async def about(self, request: Request) -> Response:
         it = self._console
         scene = it.live.scene if it.live is not None else it.need_replay().recording.scene
@@ -234,8 +258,8 @@ class _Api:
 
     async def preview(self, request: Request) -> Response:
         it = self._console
-        proposed = changed(it.config, (await _body(request)).get("settings", {}))
-        return JSONResponse(preview(it.jobs, it.need_live(), it.files, it.method, (it.config, proposed)).view())
+        in_use, proposed = Choice(it.config, it.files), it.choice(await _body(request))
+        return JSONResponse(preview(it.jobs, it.need_live(), it.method, in_use, proposed).view())
 
     # Replay
 
@@ -252,10 +276,9 @@ class _Api:
 
     async def rerun(self, request: Request) -> Response:
         body, it = await _body(request), self._console
-        config = changed(it.config, body.get("settings", {}))
         method, stretch = str(body.get("method", it.method)), _stretch(body)
         label = str(body.get("label", method))[:80]
-        return JSONResponse(it.need_replay().rerun(method, config, label, stretch).view())
+        return JSONResponse(it.need_replay().rerun(method, it.choice(body), label, stretch).view())
 
     async def bundle(self, request: Request) -> Response:
         body = await _body(request)
@@ -285,6 +308,14 @@ class _Api:
         body = await _body(request)
         path = _path(body)
         save_profile(await self._profile(request), path, replace=body.get("replace") is True)
+        return JSONResponse({"saved": str(path)})
+
+    async def limits_save(self, request: Request) -> Response:
+        body, it = await _body(request), self._console
+        if body.get("limits") is None:
+            raise InputError("alert limits: wanted a list")
+        path, station = _path(body), files_with(it.files, body["limits"]).station
+        save_profile(station.read_text(encoding="utf-8"), path, replace=body.get("replace") is True)
         return JSONResponse({"saved": str(path)})
 
     async def profile_load(self, request: Request) -> Response:

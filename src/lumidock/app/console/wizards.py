@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import shutil
 import threading
 from dataclasses import dataclass
@@ -131,12 +132,14 @@ class Calibration:
 
 
 def survey_dock(jobs: Jobs, files: Files, run: Path, asked: dict[str, Any]) -> Job:
-    """`lumidock survey` of a run, with a taped distance and how far off the drawing may be."""
+    """`lumidock survey` of a run, with labels, a taped distance and how far off the drawing may be."""
     words = ["survey", str(run), "--station", str(files.station), "--camera", str(files.camera)]
     if asked.get("off_m") is not None:
         words += ["--off", str(_number(asked, "off_m"))]
     if asked.get("tape_m") is not None:
         words += ["--distance", str(asked.get("tape_a")), str(asked.get("tape_b")), str(_number(asked, "tape_m"))]
+    if asked.get("labels"):
+        words += ["--labels", str(_write_labels(asked["labels"], files.scratch / "labels.csv"))]
     out = files.scratch / "surveyed.yaml"
     words += ["--out", str(out), "--json"]
 
@@ -145,6 +148,19 @@ def survey_dock(jobs: Jobs, files: Files, run: Path, asked: dict[str, Any]) -> J
         return job.command(words)
 
     return jobs.start("survey", work)
+
+
+def _write_labels(labels: Any, path: Path) -> Path:  # noqa: ANN401  # what a request holds
+    """The detections that the user confirmed or corrected, as `lumidock survey --labels` reads them."""
+    try:
+        rows = [(str(one["frame"]), float(one["uv"][0]), float(one["uv"][1]), str(one["light"])) for one in labels]
+    except (IndexError, KeyError, TypeError, ValueError):
+        raise InputError("labels: wanted a list of frame, uv and light") from None
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(("frame", "u_px", "v_px", "light"))
+        table.writerows(rows)
+    return path
 
 
 def _number(asked: dict[str, Any], name: str) -> float:

@@ -160,7 +160,7 @@ export class FrameView {
     const text = d.light ? `${d.light}: identified${chance}` : `Rejected. ${d.why}`;
     const told = { tabindex: d.light ? null : '0', 'aria-label': text, role: 'img',
       onpointerenter: () => { this.hint.textContent = text; }, onfocus: () => { this.hint.textContent = text; },
-      onclick: () => { this.hint.textContent = text; } };
+      onclick: () => { this.hint.textContent = text; this.picked?.(d); } };
     if (!d.light) {
       return [svg('rect', { x: x - r, y: y - r, width: 2 * r, height: 2 * r, class: 'mark rejected', ...told }, svg('title', {}, text))];
     }

@@ -4,7 +4,8 @@ import { el, get } from './api.js';
 import { Live } from './live.js';
 import { Replay } from './replay.js';
 import { Settings } from './settings.js';
-import { CalibrateWizard, SurveyWizard, dockCheck } from './wizards.js';
+import { SurveyWizard } from './survey.js';
+import { CalibrateWizard, dockCheck } from './wizards.js';
 
 const byId = (id) => document.getElementById(id);
 const KEYS = {

@@ -58,7 +58,7 @@ export class Replay {
     return el('details', {}, el('summary', {}, 'Compare with another method; pack a bundle for a report'),
       el('div', { class: 'two-columns' },
         el('div', {}, el('h3', {}, 'Another method'), el('p', { class: 'quiet' }, 'Runs the stretch, or all frames, and shows it as B. Other settings are under Settings.'),
-          el('div', { class: 'row' }, method, action('Run', told, (tell) => this.rerun(method.value, {}, method.value, tell), { 'data-writes': '' }))),
+          el('div', { class: 'row' }, method, action('Run', told, (tell) => this.rerun(method.value, { settings: {} }, method.value, tell), { 'data-writes': '' }))),
         el('div', {}, el('h3', {}, 'Bundle'), el('p', { class: 'quiet' }, 'Frames of the stretch, their run, settings and bookmarks as a zip file.'),
           notes, el('div', { class: 'row' }, action('Download', told, (tell) => this.#bundle(notes.value, tell), { 'data-writes': '' })))),
       mayWrite ? null : el('p', { class: 'quiet' }, 'Both need the address with #token= that the command printed.'), told);
@@ -197,9 +197,9 @@ export class Replay {
   }
 
   // Run with another method or settings, and show it as B.
-  async rerun(method, settings, label, tell) {
+  async rerun(method, choice, label, tell) {
     const stretch = this.stretch ? { first: this.stretch[0], last: this.stretch[1] } : {};
-    const job = await post('/api/rerun', { method, settings, label, ...stretch });
+    const job = await post('/api/rerun', { method, ...choice, label, ...stretch });
     const { variant } = await ended(job, (state) => tell(`${state} …`));
     this.data = await get('/api/recording');
     this.shown[1] = variant;

@@ -1,6 +1,7 @@
 // Settings with their meaning, tried before they are used, and profiles: files where the user says.
 
 import { action, el, ended, get, mayWrite, post, saveAs } from './api.js';
+import { Limits } from './limits.js';
 import { Timeline } from './timeline.js';
 
 const KEEP_MS = 2000;
@@ -13,12 +14,13 @@ export class Settings {
     this.result = el('div');
     this.keptSaid = el('p', { class: 'quiet' });
     this.kept = 0;
+    this.limits = new Limits(about);
     panel.append(
       el('p', {}, replay
         ? 'Change a setting and run a stretch of the recording with it, beside what was recorded. Nothing is written unless you save a profile.'
         : 'Change a setting and try it on the last seconds of the camera. Guidance keeps its own settings: save a profile, and start lumidock serve with --config and this file.'),
       this.cards, el('div', { class: 'two-columns' }, this.#trial(), this.#profile()),
-      el('div', { class: 'card' }, el('h2', {}, 'Alert limits, from the station file'), el('ul', {}, ...about.limits.map((line) => el('li', {}, line)))));
+      this.limits.root);
     this.#load();
   }
 
@@ -65,15 +67,17 @@ export class Settings {
   #trial() {
     const line = el('output', { class: 'quiet' });
     const label = this.replay ? 'Run the stretch' : 'Preview on the last seconds';
-    const reset = el('button', { type: 'button', onclick: () => { for (const { input, one } of this.inputs.values()) input.value = String(one.value); this.#changed(); } }, 'Reset');
+    const reset = el('button', { type: 'button', onclick: () => { for (const { input, one } of this.inputs.values()) input.value = String(one.value); this.limits.reset(); this.#changed(); } }, 'Reset');
     return el('div', { class: 'card' }, el('h2', {}, 'Try'),
       el('div', { class: 'row' }, action(label, line, (tell) => (this.replay ? this.#rerun(tell) : this.#preview(tell)), { 'data-writes': '' }), reset),
       this.keptSaid, line, this.result);
   }
 
   async #rerun(tell) {
-    const settings = this.values(), label = Object.entries(settings).map(([path, value]) => `${path} ${value}`).join(', ') || 'same settings';
-    const told = await this.replay.rerun(this.about.method, settings, label, tell);
+    const settings = this.values(), limits = this.limits.changed();
+    const names = Object.entries(settings).map(([path, value]) => `${path} ${value}`);
+    const label = [...names, ...(limits ? ['other alert limits'] : [])].join(', ') || 'same settings';
+    const told = await this.replay.rerun(this.about.method, { settings, limits }, label, tell);
     return `${told}. It is shown as B in Replay.`;
   }
 
@@ -90,7 +94,7 @@ export class Settings {
   async #preview(tell) {
     const settings = this.values();
     if (!this.kept) throw new Error('no frame has been kept yet; wait some seconds');
-    const job = await post('/api/preview', { settings });
+    const job = await post('/api/preview', { settings, limits: this.limits.changed() });
     const found = await ended(job, (state) => tell(`${state} …`));
     const strips = [['in_use', 'In use'], ['proposed', 'Proposed']].map(([key, title]) => {
       const strip = new Timeline({ small: true, label: title }), one = found[key], valid = [...one.trust].filter((t) => t === 'v').length;

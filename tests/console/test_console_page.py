@@ -2,12 +2,16 @@
 
 import re
 import shutil
+import subprocess
+from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from commandline import start
 from test_run import simulate
+
+from lumidock.station import load_station
 
 CHROMIUM = shutil.which("chromium")
 playwright = pytest.importorskip("playwright.sync_api")
@@ -80,6 +84,23 @@ def visit(browser, request):
     assert said == [], request.node.name
 
 
+@pytest.fixture(scope="module")
+def axe(tmp_path_factory):
+    """The source of axe-core, as npm has it now."""
+    folder = tmp_path_factory.mktemp("axe")
+    words = ["npm", "install", "--silent", "--no-audit", "--no-fund", "--prefix", str(folder), "axe-core"]
+    if shutil.which("npm") is None or subprocess.run(words, capture_output=True, timeout=120, check=False).returncode:
+        pytest.skip("npm cannot fetch axe-core")
+    return (folder / "node_modules" / "axe-core" / "axe.min.js").read_text(encoding="utf-8")
+
+
+def faults(page, axe):
+    """Serious and critical faults that axe finds in what is shown: the rule and where."""
+    page.evaluate(axe)
+    found = page.evaluate("axe.run()")["violations"]
+    return [(one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in ("serious", "critical")]
+
+
 def part(page, name):
     page.get_by_role("tab", name=name, exact=True).click()
 
@@ -104,6 +125,20 @@ def test_the_live_view_can_be_read_everywhere(visit, served, size, scheme):
         part(page, name)
         assert page.evaluate(AUDIT) == [], name
     assert page.evaluate("matchMedia('(prefers-color-scheme: dark)').matches") == (scheme == "dark")
+
+
+@pytest.mark.parametrize(("size", "scheme"), LOOKS)
+def test_axe_finds_no_serious_fault(visit, replayed, served, axe, size, scheme):
+    page = visit(replayed, size, scheme)
+    page.get_by_text("16 of 16").or_(page.get_by_text("1 of 16")).wait_for()
+    for name in ("Replay", "Settings", "Dock check", "Calibrate", "Survey"):
+        part(page, name)
+        assert faults(page, axe) == [], name
+    page = visit(served, size, scheme)
+    page.locator(".trust strong").wait_for()
+    for name in ("Live", "Settings", "Calibrate"):
+        part(page, name)
+        assert faults(page, axe) == [], name
 
 
 def test_the_live_view_shows_the_picture_and_why(visit, served):
@@ -202,11 +237,41 @@ def test_wizards_check_the_dock_and_say_why_a_survey_cannot_be(visit, replayed):
     page.get_by_role("button", name="Show three frames").click()
     boxes = page.get_by_role("checkbox", name="every light carries its own id")
     boxes.nth(2).wait_for()
+    boxes.nth(0).check()
+    page.locator("#panel-survey .mark.front").first.click(force=True)
+    chosen = page.locator("select:focus")
+    light = chosen.input_value()
+    assert re.fullmatch("[A-E]", light)
+    chosen.select_option("no light")
+    page.locator("#panel-survey .mark.rejected").first.wait_for()
+    assert not boxes.nth(0).is_checked()  # what was confirmed has changed
+    page.locator("#panel-survey .labels").first.get_by_role("combobox").nth(1).select_option(light)
     for number in range(3):
         boxes.nth(number).check()
     page.get_by_label("taped metres").fill("1.2")
-    page.get_by_role("button", name="Solve").click()
+    with page.expect_request("**/api/survey") as asked:
+        page.get_by_role("button", name="Solve").click()
+    labels = asked.value.post_data_json["labels"]
+    counts = Counter(label["frame"] for label in labels)
+    assert sorted(counts.values()) == [4, 5, 5]
+    assert [label["light"] for label in labels if counts[label["frame"]] == 4].count(light) == 1
     page.get_by_text(re.compile("residual|frames|survey refused")).last.wait_for()
+
+
+def test_alert_limits_are_tried_on_a_stretch_and_saved(visit, replayed, tmp_path):
+    page = visit(replayed)
+    page.get_by_text("1 of 16").wait_for()
+    part(page, "Settings")
+    for band in range(1, 4):
+        page.get_by_label(f"band {band}: lateral, m").fill("0.000001")
+    page.get_by_role("button", name="Run the stretch").click()
+    page.get_by_text(re.compile("^B: 0 valid of 16")).wait_for()
+    page.get_by_label("station file").fill(str(tmp_path / "strict.yaml"))
+    page.get_by_role("button", name="Save the station there").click()
+    page.get_by_text("saved:").wait_for()
+    assert load_station(tmp_path / "strict.yaml").alert_limits.bands[0].lateral_m == 1e-6
+    page.get_by_role("button", name="Reset").click()
+    assert page.get_by_label("band 1: lateral, m").input_value() == "0.3"
 
 
 def test_without_the_token_the_page_shows_and_changes_nothing(visit, replayed):
