@@ -276,10 +276,11 @@ class TrackConfig(SettingsGroup):
     # 1 sigma of a stamp against the exposure, by which the pose is off along the motion: a driver's clock on a busy
     # host has some milliseconds, a hardware trigger microseconds; 10 ms keep the valid poses that 30 ms of jitter take
     stamp_s: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
-    # factor on the covariance of centroids in the filter: errors with memory average out more slowly than white ones;
-    # 3 holds the levels where two thirds of the variance have a memory of 0.5-2 s (faults/noise-memory), and takes one
-    # valid pose in twenty; at 1 such errors end as `survey`
-    memory: Annotated[float, Field(ge=1.0, le=100.0)] = 1.0
+    # factor on the covariance of centroids in the filter: errors with memory average out more slowly than white ones.
+    # 1.4 takes one valid pose in seventy and keeps the trust of a vehicle that hovers with such errors (faults/
+    # hover-memory); 3 also holds the levels where two thirds of the variance have a memory of 0.5-2 s
+    # (faults/noise-memory), and takes one in twenty
+    memory: Annotated[float, Field(ge=1.0, le=100.0)] = 1.4
     start_m_s: Annotated[float, Field(ge=0.05, le=100.0)] = 1.5  # 1 sigma of the unknown velocity at the start
     start_rad_s: Annotated[float, Field(ge=0.01, le=100.0)] = 0.15  # 1 sigma of the unknown rotation rate at the start
     gate: Gate = 18.4  # squared Mahalanobis distance: chi-square, 2 dof, exceeded with 1e-4
