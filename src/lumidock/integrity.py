@@ -183,7 +183,9 @@ def assess(
         return no_fix(state, detections, status, reason), state
     bound = bounds(state.hypotheses, context.model, config)
     against = _contradiction(state, context)
-    doubt, limits = _doubt(state, context) or (against.file if against else ""), context.station.alert_limits
+    doubt, limits = _doubt(state, context), context.station.alert_limits
+    if against and doubt in ("", "unproven"):  # a wrong file is why an association does not reach its evidence
+        doubt = against.file
     too_wide, used = excess(bound, limits), first.last.n_used
     valid = not doubt and too_wide is None
     reason = "" if valid else doubt or _why_wide(state, config)
