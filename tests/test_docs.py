@@ -16,6 +16,8 @@ from bench.configuration import main as configuration
 from bench.shipped import CAMERA_FILE, STATION_FILE
 from commandline import LUMIDOCK
 
+from lumidock.reproduce.experiments import chosen
+
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md")), ROOT / "CONTRIBUTING.md", ROOT / "CONVENTIONS.md"]
@@ -123,6 +125,11 @@ def test_every_extra_that_is_named_exists():
     for page in PAGES:
         for words in re.findall(r"`\[([a-z,]+)\]`|'[^']*\[([a-z,]+)\]'", page.read_text(encoding="utf-8")):
             assert set("".join(words).split(",")) <= extras.keys()
+
+
+def test_every_section_of_the_reproduction_is_listed():
+    rows = re.findall(r"^\| (`.*`) \|", (ROOT / "docs" / "research.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(re.findall(r"`([^`]+)`", " ".join(rows))) == sorted(one.name for one in chosen(()))
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,11 @@
 import json
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import tomllib
 import yaml
 from conftest import assert_close
 
@@ -148,6 +150,10 @@ def test_doctor_names_every_extra(lumidock):
     assert (code, err) == (0, "")
     found = {finding["what"]: finding for finding in json.loads(out)}
     assert all(found[f"[{name}]"]["mark"] == "ok" for name in ("bag", "video", "mavlink", "zenoh", "live", "rerun"))
+    extras = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    assert {what for what in found if what.startswith("[")} == {f"[{name}]" for name in extras if name != "all"}
     assert found["Python"]["mark"] == "ok"
 
 

@@ -17,7 +17,7 @@ import numba
 import numpy as np
 
 EXTRAS = {
-    "bag": ("rosbags", "mcap"),
+    "bag": ("rosbags", "mcap", "lz4", "zstandard"),
     "video": ("av",),
     "mavlink": ("pymavlink",),
     "zenoh": ("zenoh",),
@@ -26,8 +26,9 @@ EXTRAS = {
     "console": ("starlette", "uvicorn", "wsproto"),
     "rerun": ("rerun",),
     "parquet": ("pyarrow",),
-    "report": ("matplotlib",),
+    "report": ("matplotlib", "jinja2"),
     "cluster": ("distributed",),
+    "setup": ("scipy", "cma"),
 }
 PORTS = {"console": 8780, "Foxglove": 8765}
 _FIRST_S = 1_700_000_000.0  # no clock that was ever set shows less

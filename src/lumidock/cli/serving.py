@@ -236,7 +236,8 @@ def _print_end(server: Server, as_json: bool, *, live: bool) -> None:
     if as_json:
         print(json.dumps({word: counts[word] for word in ("frames", "valid", "guide")} | {"dropped": dropped}))
     else:
-        print(f"{counts['frames']} frames: {counts['valid']} valid; {dropped} came too fast and were dropped")
+        usable = f"{counts['valid']} valid, {counts['guide']} with a guide"
+        print(f"{counts['frames']} frames: {usable}; dropped because they came too fast: {dropped}")
     if server.camera.problem and not live:
         raise InputError(server.camera.problem)
 

@@ -125,8 +125,8 @@ def _dry(bend: float, ratio: float | None, distorted: bool) -> list[str]:
         return []
     if not distorted:
         return [
-            "no distortion at all: only pictures that were rectified have none, and nothing here tells a calibration "
-            f"in water from one in air, with which ranges come out {100 * (1 - 1 / WATER):.0f} % short"
+            "no distortion at all, as only rectified pictures have; so nothing tells whether it was made in water, and "
+            f"if it was made in air, ranges come out {100 * (1 - 1 / WATER):.0f} % short"
         ]
     if bend < _LOOKS_DRY:
         return [
