@@ -26,6 +26,8 @@ from lumidock import cli
 from lumidock.cli import progress
 from lumidock.errors import InputError
 
+pytest_plugins = ["console_fixtures"]
+
 settings.register_profile("lumidock", derandomize=True, deadline=None, database=None, max_examples=200)
 settings.load_profile("lumidock")
 

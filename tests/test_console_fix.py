@@ -14,7 +14,7 @@ from lumidock.datatypes import Alternative, Fix, Guide, Protection
 
 
 def test_every_reason_of_the_documentation_is_explained_alike():
-    text = (Path(__file__).parents[2] / "docs" / "reasons.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[1] / "docs" / "reasons.md").read_text(encoding="utf-8")
     rows = {
         row[0].strip("` "): row[1:3]
         for line in text.splitlines()

@@ -89,7 +89,7 @@ def test_the_policy_lets_nothing_in_from_outside(live):
     assert answer.headers["x-content-type-options"] == "nosniff"
 
 
-STATIC = Path(__file__).parents[2] / "src" / "lumidock" / "app" / "console" / "static"
+STATIC = Path(__file__).parents[1] / "src" / "lumidock" / "app" / "console" / "static"
 
 
 def test_the_page_names_no_other_host_and_has_nothing_inline():

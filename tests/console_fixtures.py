@@ -13,8 +13,8 @@ from lumidock.station import load_station
 from lumidock.streams.sources import open_source
 
 
-@pytest.fixture(autouse=True)
-def _same_priority(monkeypatch):
+@pytest.fixture
+def same_priority(monkeypatch):
     """Or the tests would wait for whatever else the machine does."""
     monkeypatch.setattr("lumidock.app.console.jobs._NICE", 0)
 
@@ -30,7 +30,7 @@ def scene(folder):
 
 
 @pytest.fixture
-def live(folder, scene, tmp_path):
+def live(folder, scene, tmp_path, same_priority):
     """A console of a live camera whose newest frame is the first of the sequence."""
     from asking import files
 
@@ -43,7 +43,7 @@ def live(folder, scene, tmp_path):
 
 
 @pytest.fixture
-def replay(folder, scene, tmp_path):
+def replay(folder, scene, tmp_path, same_priority):
     """A console of the sequence, read to its end."""
     from asking import files
 
