@@ -110,10 +110,10 @@ def check_attacked(pair, fate, apart_s, served_s):
             process.stdout.close()
 
 
-@pytest.mark.parametrize("fate", [signal.SIGKILL, signal.SIGTERM])
-def test_of_two_servers_one_serves_and_the_other_is_refused(sequence, tmp_path, fate):
+@pytest.mark.parametrize(("fate", "apart_s"), [(signal.SIGKILL, 0.0), (signal.SIGTERM, 0.5)])
+def test_of_two_servers_one_serves_and_the_other_is_refused(sequence, tmp_path, fate, apart_s):
     (tmp_path / "temporary").mkdir()
-    check_attacked(Pair(sequence, tmp_path, "folder and ports"), fate, 0.2, 0.7)
+    check_attacked(Pair(sequence, tmp_path, "folder and ports"), fate, apart_s, 0.7)
 
 
 @pytest.mark.slow
