@@ -156,6 +156,12 @@ STEREO = "image_width: 640\nimage_height: 480\n" + "".join(
 )
 BINNED = camera(size=(320, 240), k=[350.0, 0, 155.0, 0, 352.5, 122.25, 0, 0, 1])
 
+WINDOW = camera(size=(200, 150), k=[350.0, 0, 105.0, 0, 352.5, 92.25, 0, 0, 1])
+COLUMN = f"%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n{matrix('K', K, 3)}{matrix('D', D[:4], 4)}"
+GYROFLOW = json.dumps(
+    {"calib_dimension": {"w": 640, "h": 480}, "fisheye_params": {"camera_matrix": ROWS, "distortion_coeffs": FISHEYE}}
+)
+
 # tool, what of it, content, and the camera that comes out or the words of the refusal
 FILES = [
     ("OpenCV YAML", "camera_matrix, distortion_coefficients", opencv(), PLUMB),
@@ -184,6 +190,7 @@ FILES = [
         opencv(numbers=[0.1, 0.2, 0.3, -0.1]),
         "of a fisheye?",
     ),
+    ("OpenCV YAML", "four coefficients, one below the other", COLUMN, "of a fisheye?"),
     ("OpenCV YAML", "stereo (M1, D1, M2, D2)", "%YAML:1.0\n---\n" + STEREO, "choose with --name: 1, 2"),
     (
         "OpenCV YAML",
@@ -226,6 +233,18 @@ FILES = [
     ("ROS camera_info YAML", "no coefficients", ros(numbers=[]), NONE),
     ("ROS camera_info YAML", "byte order mark", "\ufeff" + ros(), PLUMB),
     ("ROS camera_info YAML", "binning_x, binning_y", ros(more="binning_x: 2\nbinning_y: 2\n"), BINNED),
+    (
+        "ROS camera_info YAML",
+        "region of interest, then binning",
+        ros(more="binning_x: 2\nbinning_y: 2\nroi: {x_offset: 100, y_offset: 60, width: 400, height: 300}\n"),
+        WINDOW,
+    ),
+    (
+        "ROS camera_info YAML",
+        "region of interest off the sensor",
+        ros(more="roi: {x_offset: 500, y_offset: 60, width: 400, height: 300}\n"),
+        "is not on a sensor of 640x480",
+    ),
     ("ROS camera_info YAML", "another model", ros("distortion_model: warp"), "distortion model 'warp'"),
     ("ROS camera_info YAML", "skew", ros().replace("[700.0, 0.0", "[700.0, 0.35"), "a skew of 0.35 px"),
     ("ROS CameraInfo message", "as `ros2 topic echo` prints it", ECHO, PLUMB),
@@ -282,7 +301,22 @@ FILES = [
     ("calib.io JSON", "other models", calibio("CameraModelDoubleSphere"), "calib.io's CameraModelDoubleSphere"),
     ("PhotonVision JSON", "as exported", PHOTONVISION, RATIO),
     ("Matlab, Bouguet's toolbox", "Calib_Results.m", BOUGUET, PLUMB),
+    ("MATLAB", "cameraParameters as JSON", '{"FocalLength": [7, 7], "RadialDistortion": [0, 0]}', "of MATLAB"),
     ("MATLAB", ".mat", "MATLAB 5.0 MAT-file, Platform", "a MAT-file of MATLAB"),
+    ("Gyroflow", "lens profile", GYROFLOW, EQUI),
+    ("DepthAI", "as stored on the camera", '{"cameraData": []}', "a calibration of DepthAI"),
+    ("RealSense", "intrinsics as JSON", '{"width": 640, "height": 480, "ppx": 320, "ppy": 240}', "of RealSense"),
+    ("ZED", "SN*.conf", "[LEFT_CAM_HD]\nfx=700\n", "a calibration of ZED"),
+    ("SVO or OKVIS", "cameras", "cameras:\n- camera: {label: cam0}\n", "of SVO or OKVIS"),
+    ("KITTI", "calib.txt", "P0: 718 0 607 0 0 718 185 0 0 0 1 0\n", "a calibration of KITTI"),
+    ("DSO", "camera.txt", "Pinhole 0.5 0.6 0.5 0.5 0\n640 480\ncrop\n640 480\n", "of a direct VO"),
+    ("OCamCalib", "calib_results.txt", "#polynomial coefficients for the DIRECT mapping\n5 -69\n", "of OCamCalib"),
+    (
+        "RealityCapture",
+        "XMP",
+        '<x xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#" xcr:FocalLength35mm="24"/>',
+        "of RealityCapture",
+    ),
     ("Basalt", "calibration.json", '{"value0": {"intrinsics": []}}', "a calibration of Basalt"),
     ("nerfstudio", "transforms.json", '{"fl_x": 700, "frames": []}', "a calibration of nerfstudio"),
     ("lumidock", "a station file", "schema: 1\nname: a\nlights: []\n", "a station file"),

@@ -321,6 +321,20 @@ def test_a_damaged_chunk_costs_its_own_frames_also_without_a_summary(tmp_path, c
         assert len(missing) == 1
 
 
+@pytest.mark.parametrize("claimed", [2**63, 2**64 - 1])
+def test_a_chunk_that_claims_more_than_can_be_counted_costs_its_own_frames(tmp_path, good, claimed):
+    data = good["mcap"]
+    starts = [
+        at for at in range(len(data)) if data[at : at + 1] == b"\x06" and data[at + 37 : at + 45] == b"\x04\0\0\0zstd"
+    ]
+    size_at = starts[2] + 45  # of the compressed records, behind the name of the compression
+    path = tmp_path / "claims.mcap"
+    path.write_bytes(data[:size_at] + claimed.to_bytes(8, "little") + data[size_at + 8 :])
+    items = read(path)
+    assert len([item for item in items if isinstance(item, Frame)]) == 5
+    assert any(isinstance(item, Unusable) for item in items)
+
+
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(draw=st.data())
 @pytest.mark.parametrize("kind", bags.KINDS)

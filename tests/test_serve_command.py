@@ -255,17 +255,6 @@ def test_a_second_server_touches_nothing_of_the_first(sequence, tmp_path):
     check_attacked(sequence, tmp_path, 0.5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("part", range(5))
-def test_two_hundred_starts_and_kills_under_attack(sequence, tmp_path, rng, part):
-    for number in range(40):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        seconds = float(rng.uniform(0.0, 2.0))
-        print(f"part {part}, kill {number}: after {seconds:.3f} s")  # noqa: T201  # in the report of a failure
-        check_attacked(sequence, folder, seconds)
-
-
 def test_garbage_and_floods_on_every_port_are_borne(sequence, rng, listener):
     port = free_port()
     mavlink = ("--vehicle", sequence / "vehicle.yaml", "--mavlink", f"127.0.0.1:{listener.port}")

@@ -313,6 +313,16 @@ class _Port(BaseModel):
     glass_index: Annotated[float, Field(ge=1.0, le=2.5)] = 1.5
 
 
+class _Window(BaseModel):
+    """A region of interest; all zero is the whole sensor."""
+
+    model_config = ConfigDict(extra="ignore")
+    x_offset: Annotated[int, Field(ge=0)] = 0
+    y_offset: Annotated[int, Field(ge=0)] = 0
+    width: Annotated[int, Field(ge=0)] = 0
+    height: Annotated[int, Field(ge=0)] = 0
+
+
 class _CameraInfo(BaseModel):
     """The part of ROS camera_info that lumidock reads; its other keys are let pass."""
 
@@ -325,6 +335,7 @@ class _CameraInfo(BaseModel):
     distortion_coefficients: _Matrix
     binning_x: Annotated[int, Field(ge=0)] = 0
     binning_y: Annotated[int, Field(ge=0)] = 0
+    roi: _Window | None = None
     port: _Port | None = None
 
 
@@ -352,8 +363,30 @@ def camera_of_mapping(content: dict[str, Any], path: Path) -> Camera:
     if info.port is not None:
         values = info.port.model_dump(exclude={"kind"})
         camera = replace(camera, port=FlatPort(**values))
-    binning = max(info.binning_x, 1), max(info.binning_y, 1)
-    return camera if binning == (1, 1) else binned(camera, binning)
+    roi = info.roi or _Window()
+    window = roi.x_offset, roi.y_offset, roi.width, roi.height
+    return windowed(camera, str(path), window, (max(info.binning_x, 1), max(info.binning_y, 1)))
+
+
+def windowed(camera: Camera, origin: str, roi: tuple[int, int, int, int], binning: tuple[int, int]) -> Camera:
+    """The camera of the pixels that are sent: region of interest (x, y, width, height px) first, then binning.
+
+    A region without width or height is the whole sensor. Raises: InputError, which calls the calibration `origin`.
+    """
+    x, y, width, height = roi
+    if width and height:
+        if x + width > camera.width or y + height > camera.height:
+            raise InputError(
+                f"{origin}: a region of interest of {width}x{height} pixels at ({x}, {y}) is not on a sensor of "
+                f"{camera.width}x{camera.height}; width and height have to be the full sensor's. Give --camera FILE"
+            )
+        if (x, y, width, height) != (0, 0, camera.width, camera.height):
+            camera = cropped(camera, (x, y), (width, height))
+    if binning == (1, 1):
+        return camera
+    if min(camera.width // binning[0], camera.height // binning[1]) < 1:
+        raise InputError(f"{origin}: a binning of {binning[0]}x{binning[1]} leaves no pixel")
+    return binned(camera, binning)
 
 
 def binned(camera: Camera, binning: tuple[int, int]) -> Camera:

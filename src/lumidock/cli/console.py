@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lumidock.camera import Camera, load_camera, save_camera
+from lumidock.cli.scratch import scratch_folder
 from lumidock.cli.shared import (
     SIM,
     AsStored,
@@ -106,7 +106,7 @@ class LivePage:
                 yield f"{hint}health at http://{host}:{page.port}/"
                 return
             self.shown.health = self.health
-            scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lumidock-console-")))
+            scratch = stack.enter_context(scratch_folder())
             server = _open(stack, self._console(scratch), host, ("--health-port", port))
             yield f"console at http://{host}:{server.port}/#token={server.token}"
 
@@ -191,7 +191,7 @@ def _console(
         fps, topic, info_topic, bits, as_stored=as_stored, trusted=trust_calibration, follow_calibration=camera is None
     )
     with ExitStack() as stack:
-        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lumidock-console-")))
+        scratch = stack.enter_context(scratch_folder())
         if is_run(Path(target)):
             recording = _of_run(Path(target), source, scratch)
         else:

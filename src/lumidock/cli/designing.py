@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +11,7 @@ import typer
 
 from lumidock.camera import load_camera
 from lumidock.cli.progress import progress_bar
+from lumidock.cli.scratch import scratch_folder
 from lumidock.cli.shared import (
     DEFAULT_CAMERA,
     DEFAULT_STATION,
@@ -48,8 +48,8 @@ def _design(
     spec = load_spec(source)
     spec = spec if seed is None else spec.model_copy(update={"seed": seed})
     lens = load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))
-    with tempfile.TemporaryDirectory() as work, progress_bar("design") as progress:
-        found = design(spec, lens, Config(), Path(work) / "layout.yaml", progress)
+    with scratch_folder() as work, progress_bar("design") as progress:
+        found = design(spec, lens, Config(), work / "layout.yaml", progress)
         judged = strength(
             found.station, lens, Config(), approach_of(spec, found.station), dead_sets(len(found.station), spec.dead)
         )

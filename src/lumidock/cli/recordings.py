@@ -6,12 +6,12 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
 
 from lumidock.app.run import Setup, identity_of, run
+from lumidock.cli.scratch import scratch_folder
 from lumidock.cli.shared import (
     Calibration,
     calibration_of,
@@ -190,8 +190,8 @@ def _finished(recording: Recording, job: Job) -> dict[str, Any] | None:
         return None
     try:
         described = json.loads((job.out / "run.json").read_text(encoding="utf-8"))
-        with TemporaryDirectory() as folder:
-            camera_file = keep_camera(recording.calibration, Path(folder) / "camera.yaml")
+        with scratch_folder() as folder:
+            camera_file = keep_camera(recording.calibration, folder / "camera.yaml")
             identity = json.loads(json.dumps(identity_of(recording.source, recording.setup(camera_file))))
         same = all(described.get(name) == value for name, value in identity.items())
         counts = dict(described["counts"])

@@ -6,7 +6,6 @@ import json
 import math
 import re
 import sys
-import tempfile
 import threading
 from contextlib import ExitStack
 from functools import partial
@@ -21,6 +20,7 @@ from lumidock.app.serve import STALE_S, Newest, Server, SourceReader, Worker
 from lumidock.app.warm import warm_up
 from lumidock.cli.console import ConsoleOption, LivePage, live_view, stopped_by_signals, wants_console
 from lumidock.cli.recordings import Recording, RunOptions, open_recording
+from lumidock.cli.scratch import scratch_folder
 from lumidock.cli.shared import (
     SIM,
     AsJson,
@@ -200,7 +200,7 @@ def _serve(
 def _opened(stack: ExitStack, source: str, options: RunOptions, network: Network) -> Recording:
     """The source, with what a person should know of it said; a scenario is rendered for as long as the stack lasts."""
     if source.startswith(SIM):
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder = stack.enter_context(scratch_folder())
         source = str(simulated(source, folder / "sequence", options.station, options.camera))
     recording = open_recording(source, options, network)
     tell(recording.notes)

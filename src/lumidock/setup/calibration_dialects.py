@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lumidock.camera import Camera, camera_from
 from lumidock.errors import InputError
+from lumidock.setup.calibration_opencv import WAY_OUT
 from lumidock.yamlfile import validate
 
 _KALIBR_MODELS = {"radtan": "plumb_bob", "radial-tangential": "plumb_bob", "equi": "equidistant"}
@@ -282,11 +283,29 @@ def read_ost(path: Path, text: str, name: str | None) -> Camera:
     return camera_from(f"{path}: {chosen}", (width, height), matrix, "", coefficients)
 
 
+# what is no XML, JSON or YAML, or reads as other than it is, by what its text says of itself
+REFUSED_TEXTS = {
+    "OCamCalib": (re.compile(r"\A#polynomial coefficients"), "calibrate as a fisheye (OpenCV or Kalibr's equi)"),
+    "a direct VO (DSO, mono-VO)": (
+        re.compile(r"\A(Pinhole|FOV|RadTan|EquiDistant|KannalaBrandt|ATAN)\s+[-.\d]"),
+        WAY_OUT,
+    ),
+    "ZED": (re.compile(r"^\[LEFT_CAM_", re.MULTILINE), "take K and D of the resolution in use from ZED's CameraInfo"),
+    "RealityCapture": (re.compile(r"capturingreality\.com/ns/xcr"), "export to COLMAP"),
+}
 REFUSED: dict[str, tuple[Callable[[dict[str, Any]], bool], str]] = {
     "Basalt": (lambda c: "value0" in c, "convert it to Kalibr's camchain"),
     "nerfstudio or instant-ngp": (
         lambda c: "fl_x" in c or "camera_angle_x" in c,
         "use the COLMAP cameras.txt it came from",
+    ),
+    "DepthAI": (lambda c: "cameraData" in c, "take K and D of the resolution in use from DepthAI's CameraInfo"),
+    "RealSense": (lambda c: {"ppx", "ppy"} <= c.keys(), "take K and D from the CameraInfo of realsense2_camera"),
+    "SVO or OKVIS": (lambda c: isinstance(c.get("cameras"), list), "convert it to Kalibr's camchain"),
+    "KITTI": (lambda c: "P0" in c or "P_rect_00" in c, WAY_OUT),
+    "MATLAB": (
+        lambda c: any(key in c for key in ("RadialDistortion", "IntrinsicMatrix", "PrincipalPoint")),
+        f"convert it with MATLAB's cameraIntrinsicsToOpenCV and {WAY_OUT}",
     ),
     "Azure Kinect": (lambda c: "CalibrationInformation" in c or "CameraCalibration" in c, _WAY_OUT),
     "OpenSfM": (

@@ -16,14 +16,13 @@ import yaml
 from lumidock.camera import Camera, camera_of_mapping, save_camera
 from lumidock.errors import InputError
 from lumidock.setup import calibration_dialects as dialects
-from lumidock.setup.calibration_opencv import read_opencv
+from lumidock.setup.calibration_opencv import WAY_OUT, read_opencv
 from lumidock.streams.camera_info import CameraInfo, camera_of
 from lumidock.yamlfile import parse_mapping, read_text
 
 _HEAD = 128  # bytes that tell files that are no text
 _BINARY = {b"MATLAB 5.0 MAT-file": "a MAT-file of MATLAB", b"\x89HDF": "a MAT-file of MATLAB (7.3) or HDF5"}
 _BINARY |= {b"PK\x03\x04": "an archive (.npz of NumPy?)", b"\x93NUMPY": "a NumPy array", b"\x80\x04": "a Python pickle"}
-_WAY_OUT = "write image_width, image_height, camera_matrix and distortion_coefficients as an OpenCV or ROS YAML file"
 _OPENCV_TAG = re.compile(r"!!opencv-[a-z-]+|!<tag:[^>]*>")
 
 
@@ -54,11 +53,14 @@ def _text(path: Path) -> str:
         raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
     for magic, what in _BINARY.items():
         if head.startswith(magic):
-            raise InputError(f"{path}: {what}, which is not read; {_WAY_OUT}")
+            raise InputError(f"{path}: {what}, which is not read; {WAY_OUT}")
     return read_text(path).lstrip()
 
 
 def _read(path: Path, text: str, name: str | None, size: tuple[int, int] | None) -> tuple[str, Camera]:
+    for tool, (pattern, way_out) in dialects.REFUSED_TEXTS.items():
+        if pattern.search(text):
+            raise InputError(f"{path}: a calibration of {tool}, which is not read; {way_out}")
     if text.startswith("<"):
         return _read_xml(path, text, name, size)
     if text.startswith("# oST") or re.match(r"\[[A-Za-z_ ]+\]\s", text):
@@ -146,7 +148,7 @@ def _json(path: Path, text: str) -> tuple[dict[str, Any], bool]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not valid JSON: {' '.join(str(error).split())}") from None
     if not isinstance(content, dict):
-        raise InputError(f"{path}: JSON without keys; {_WAY_OUT}")
+        raise InputError(f"{path}: JSON without keys; {WAY_OUT}")
     return content, True
 
 
@@ -155,7 +157,10 @@ def _yaml(path: Path, text: str) -> tuple[dict[str, Any], bool]:
     is_opencv = "opencv-matrix" in text
     lines = [line for line in _OPENCV_TAG.sub("", text).splitlines() if not line.startswith("%")]
     first = "\n".join(lines).removeprefix("---").split("\n---", 1)[0]
-    return parse_mapping(first, path), is_opencv
+    try:
+        return parse_mapping(first, path), is_opencv
+    except InputError as error:
+        raise InputError(f"{error}; {WAY_OUT}") from None
 
 
 def _read_xml(path: Path, text: str, name: str | None, size: tuple[int, int] | None) -> tuple[str, Camera]:
@@ -172,7 +177,7 @@ def _read_xml(path: Path, text: str, name: str | None, size: tuple[int, int] | N
             f"{path}: a project of Metashape; export the camera calibration alone (Tools, Camera Calibration)"
         )
     if root.tag != "opencv_storage":
-        raise InputError(f"{path}: XML of <{root.tag[:40]}>, which is not read; {_WAY_OUT}")
+        raise InputError(f"{path}: XML of <{root.tag[:40]}>, which is not read; {WAY_OUT}")
     content: dict[str, Any] = {
         entry.tag: {part.tag: part.text or "" for part in entry} if len(entry) else entry.text or "" for entry in root
     }

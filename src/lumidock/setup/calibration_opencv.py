@@ -16,6 +16,7 @@ import numpy as np
 from lumidock.camera import Camera, camera_from
 from lumidock.errors import InputError
 
+WAY_OUT = "write image_width, image_height, camera_matrix and distortion_coefficients as an OpenCV or ROS YAML file"
 # names as they are written, less case and all but letters and digits
 _MATRIX = (
     "cameramatrix,cameraintrinsics,cameraintrinsicmatrix,cammatrix,cammtx,cameramtx,mtx,intrinsics,intrinsic,"
@@ -41,7 +42,17 @@ _WIDTH, _HEIGHT = (
     ("imagewidth", "width", "imgwidth", "w", "framewidth"),
     ("imageheight", "height", "imgheight", "h", "frameheight"),
 )
-_SIZE = ("imagesize", "imgsize", "resolution", "size", "imageresolution", "framesize", "imagesizewh")
+_SIZE = (
+    "imagesize",
+    "imgsize",
+    "resolution",
+    "size",
+    "imageresolution",
+    "framesize",
+    "imagesizewh",
+    "calibdimension",
+    "dim",
+)
 _SHAPE = ("imageshape", "imgshape", "shape")  # of an array: rows first
 _FLAGS = ("fisheyemodel", "fisheye", "isfisheye", "usefisheye")
 _MODELS = (
@@ -78,7 +89,8 @@ def read_opencv(path: Path, content: dict[str, Any], name: str | None, size: tup
     with_matrix = [label for label, found in cameras.items() if found.matrix]
     if not with_matrix:
         raise InputError(
-            f"{path}: no calibration of a tool that is known: no camera matrix of 3 x 3 under any of its names"
+            f"{path}: no calibration of a tool that is known: no camera matrix of 3 x 3 under any of its names; "
+            f"{WAY_OUT}"
         )
     label = _chosen(path, cameras, with_matrix, name)
     _refuse_unknown(path, leaves)
@@ -98,12 +110,9 @@ def read_opencv(path: Path, content: dict[str, Any], name: str | None, size: tup
     found_size = _size(path, content) or size
     if found_size is None:
         raise InputError(f"{path}: says no image size; give --size WIDTHxHEIGHT to `lumidock calib import`")
-    model = _model(path, leaves)
-    if model == "" and len(coefficients) == 4 and max(map(abs, coefficients[2:])) > _MOST_TANGENTIAL:
-        raise InputError(
-            f"{path}: {named}: four coefficients of which the last two are no tangential ones; of a fisheye? say so "
-            "with fisheye_model: 1 in the file, or fisheye_model: 0"
-        )
+    model = _model(path, leaves, label)
+    if model == "" and len(coefficients) == 4:
+        _refuse_ambiguous(path, named, coefficients, leaves)
     return camera_from(str(path), found_size, matrix, "" if model == "perspective" else model, coefficients)
 
 
@@ -184,15 +193,43 @@ def _refuse_unknown(path: Path, leaves: list[tuple[str, str, Any]]) -> None:
         if taken or plain in (*_FLAGS, *_MODELS) or _IS_NOT.search(plain):
             continue
         if numbers is not None and any(numbers) and _COULD_BE_DISTORTION.search(plain):
-            what = "an omnidirectional camera (xi), which is not supported" if plain == "xi" else "could be distortion"
+            if plain == "xi":
+                raise InputError(
+                    f"{path}: key {key}: an omnidirectional camera (xi), which is not supported; calibrate as pinhole "
+                    "or fisheye"
+                )
             raise InputError(
-                f"{path}: key {key}: {what}; put the coefficients k1, k2, p1, p2[, k3] under distortion_coefficients"
+                f"{path}: key {key}: could be distortion; put the coefficients k1, k2, p1, p2[, k3] under "
+                "distortion_coefficients"
             )
 
 
-def _model(path: Path, leaves: list[tuple[str, str, Any]]) -> str:
-    """The model that a file names or flags, equidistant or perspective; empty where it does not. Raises: InputError."""
-    found = ""
+def _refuse_ambiguous(path: Path, named: str, coefficients: list[float], leaves: list[tuple[str, str, Any]]) -> None:
+    """Raises: InputError for four coefficients that may be a fisheye's: too large, or one below the other.
+
+    cv2.fisheye.calibrate gives 4 x 1 numbers; cv2.calibrateCamera gives five or more, and its C forerunner gave 1 x 4.
+    """
+    column = any(key == named and _is_column(value) for _, key, value in leaves)
+    if column or max(map(abs, coefficients[2:])) > _MOST_TANGENTIAL:
+        what = "stand one below the other" if column else "of which the last two are no tangential ones"
+        raise InputError(
+            f"{path}: {named}: four coefficients {'that ' if column else ''}{what}; of a fisheye? say so with "
+            "fisheye_model: 1 in the file, or fisheye_model: 0"
+        )
+
+
+def _is_column(value: object) -> bool:
+    if isinstance(value, dict):
+        return str(value.get("rows")).strip() == "4" and str(value.get("cols")).strip() == "1"
+    return isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value)
+
+
+def _model(path: Path, leaves: list[tuple[str, str, Any]], label: str) -> str:
+    """The model that a file names or flags, equidistant or perspective; empty where it does not. Raises: InputError.
+
+    The keys above a camera, `label`, may name it too, as Gyroflow's fisheye_params.
+    """
+    found = "equidistant" if "fisheye" in _plain(label) else ""
     for _, key, value in leaves:
         plain, word = _plain(key), str(value).strip().strip('"').lower()
         if plain in _FLAGS:
@@ -214,7 +251,9 @@ def _size(path: Path, content: dict[str, Any]) -> tuple[int, int] | None:
         entry = flat.get(key)
         if isinstance(entry, dict) and "data" not in entry:
             inner = {_plain(str(name)): value for name, value in entry.items()}
-            entry = [inner.get("width"), inner.get("height")] if {"width", "height"} <= inner.keys() else None
+            entry = next(
+                ([inner[a], inner[b]] for a, b in (("width", "height"), ("w", "h")) if {a, b} <= inner.keys()), None
+            )
         numbers = _numbers(entry) if entry is not None else None
         if numbers and len(numbers) >= 2:
             numbers = numbers[1::-1] if key in _SHAPE else numbers[:2]

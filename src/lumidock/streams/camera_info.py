@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lumidock.camera import Camera, binned, camera_from, cropped
+from lumidock.camera import Camera, camera_from, windowed
 from lumidock.errors import InputError
 from lumidock.streams.calibration_check import require_possible
 
@@ -56,7 +56,7 @@ def camera_of(info: CameraInfo, *, rectified: bool = False, trusted: bool = Fals
         raise InputError(f"{info.origin}: the camera is not calibrated; give --camera FILE")
     sensor, notes = _rectified(info) if rectified else (_raw(info), ())
     require_possible(sensor, info.origin, trusted=trusted)
-    camera = _window(info, sensor)
+    camera = windowed(sensor, info.origin, info.roi, info.binning)
     if camera is not sensor:
         notes = (*notes, _window_note(info, camera))
     return camera, notes
@@ -86,25 +86,6 @@ def _rectified(info: CameraInfo) -> tuple[Camera, tuple[str, ...]]:
             "against the raw one"
         )
     return camera, tuple(notes)
-
-
-def _window(info: CameraInfo, sensor: Camera) -> Camera:
-    """The camera of the pixels that are sent: region of interest first, then binning."""
-    x, y, width, height = info.roi
-    camera = sensor
-    if width and height:
-        if x + width > sensor.width or y + height > sensor.height:
-            raise InputError(
-                f"{info.origin}: a region of interest of {width}x{height} pixels at ({x}, {y}) is not on a sensor of "
-                f"{sensor.width}x{sensor.height}; width and height have to be the full sensor's. Give --camera FILE"
-            )
-        if (x, y, width, height) != (0, 0, sensor.width, sensor.height):
-            camera = cropped(camera, (x, y), (width, height))
-    if info.binning != (1, 1):
-        if min(camera.width // info.binning[0], camera.height // info.binning[1]) < 1:
-            raise InputError(f"{info.origin}: a binning of {info.binning[0]}x{info.binning[1]} leaves no pixel")
-        camera = binned(camera, info.binning)
-    return camera
 
 
 def _window_note(info: CameraInfo, camera: Camera) -> str:

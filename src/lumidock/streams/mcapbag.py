@@ -30,7 +30,10 @@ _HEAD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<BQQQQII")
 _CHUNK_OPCODE, _LONGEST_NAME, _BLOCK = bytes([int(Opcode.CHUNK)]), 8, 1 << 20
 _LAST_OPCODE = int(Opcode.DATA_END)
-_DAMAGED = (McapError, ValueError, EOFError, struct.error, MemoryError, RuntimeError, KeyError, zstandard.ZstdError)
+_DAMAGED = (
+    *(McapError, ValueError, EOFError, OverflowError, struct.error),
+    *(MemoryError, RuntimeError, KeyError, zstandard.ZstdError),
+)
 
 
 def topics(path: Path) -> list[Topic]:

@@ -65,7 +65,10 @@ _DEFINITIONS |= {
         "float32[4] beam_velocity\nfloat32[4] beam_velocity_covar\n"
     ),
 }
-UNREADABLE = (SerdeError, ValueError, IndexError, KeyError, TypeError, AssertionError, struct.error, MemoryError)
+UNREADABLE = (
+    *(SerdeError, ValueError, IndexError, KeyError, TypeError),
+    *(AssertionError, OverflowError, struct.error, MemoryError),
+)
 # by what encoders and formats are called, as PyAV calls the decoder
 _CODECS = {"h264": "h264", "avc": "h264", "h265": "hevc", "hevc": "hevc", "vp9": "vp9", "av1": "av1", "vp8": "vp8"}
 _START = (b"\0\0\0\1", b"\0\0\1")

@@ -18,7 +18,7 @@ _MAGIC = b"#ROSBAG V2.0\n"
 _MAX_RECORD = 1 << 28
 _LENGTH = struct.Struct("<I")
 _MESSAGE, _HEADER, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
-_DAMAGED = (ValueError, KeyError, EOFError, OSError, RuntimeError, MemoryError, struct.error)
+_DAMAGED = (ValueError, KeyError, EOFError, OverflowError, OSError, RuntimeError, MemoryError, struct.error)
 
 _Fields = dict[str, bytes]
 

@@ -14,7 +14,7 @@ from lumidock.streams.ros import Broken, Message, Topic, ros2_type
 
 _MAX_MESSAGE = 1 << 28
 _ZSTD = b"\x28\xb5\x2f\xfd"
-_DAMAGED = (sqlite3.Error, ValueError, TypeError, MemoryError, zstandard.ZstdError)
+_DAMAGED = (sqlite3.Error, ValueError, TypeError, OverflowError, MemoryError, zstandard.ZstdError)
 _TABLES = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages')"
 
 

@@ -46,6 +46,9 @@ class ConsoleServer:
         end_s = time.monotonic() + _STARTING_S
         while not self._server.started and self._thread.is_alive() and time.monotonic() < end_s:
             time.sleep(0.01)
+        if not self._server.started:
+            self.close()
+            raise OSError("the console did not start")
 
     @property
     def port(self) -> int:
@@ -66,6 +69,7 @@ def _listening(host: str, port: int) -> socket.socket:
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(address)
+        listener.listen()  # only now is the port nobody else's: two sockets may be bound to it
     except OSError:
         listener.close()
         raise
