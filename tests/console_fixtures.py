@@ -13,10 +13,8 @@ from lumidock.station import load_station
 from lumidock.streams.sources import open_source
 
 
-@pytest.fixture
-def same_priority(monkeypatch):
-    """Or the tests would wait for whatever else the machine does."""
-    monkeypatch.setattr("lumidock.app.console.jobs._NICE", 0)
+# of the console's jobs; or the tests would wait for whatever else the machine does
+_SAME_PRIORITY = "lumidock.app.console.jobs._NICE", 0
 
 
 @pytest.fixture(scope="session")
@@ -30,12 +28,13 @@ def scene(folder):
 
 
 @pytest.fixture
-def live(folder, scene, tmp_path, same_priority):
+def live(folder, scene, tmp_path, monkeypatch):
     """A console of a live camera whose newest frame is the first of the sequence."""
     from asking import files
 
     from lumidock.app.console.routes import Console
 
+    monkeypatch.setattr(*_SAME_PRIORITY)
     view = LiveView(scene, lambda: {"camera": {"frames": 1}})
     console = Console(files(folder, tmp_path), "lumidock", Config(), "dock small", live=view, health=view.health)
     yield console
@@ -43,12 +42,13 @@ def live(folder, scene, tmp_path, same_priority):
 
 
 @pytest.fixture
-def replay(folder, scene, tmp_path, same_priority):
+def replay(folder, scene, tmp_path, monkeypatch):
     """A console of the sequence, read to its end."""
     from asking import files
 
     from lumidock.app.console.routes import Console
 
+    monkeypatch.setattr(*_SAME_PRIORITY)
     localizer = localizer_of("lumidock", scene.station, CAMERA, Config())
     recording = Recording(
         scene, folder / "station.yaml", folder / "camera.yaml", "lumidock", Config(), open_source(folder), None
