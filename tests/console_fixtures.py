@@ -12,7 +12,6 @@ from lumidock.methods import localizer_of
 from lumidock.station import load_station
 from lumidock.streams.sources import open_source
 
-
 # of the console's jobs; or the tests would wait for whatever else the machine does
 _SAME_PRIORITY = "lumidock.app.console.jobs._NICE", 0
 
