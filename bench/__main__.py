@@ -39,6 +39,7 @@ from bench import (
     rendering,
     reproduced,
     speed,
+    surveys,
     table1,
     visibility,
 )
@@ -63,6 +64,7 @@ BENCHES = {
     "dockings": dockings,
     "faults": faults,
     "docks": docks,
+    "surveys": surveys,
     "visibility": visibility,
     "rendering": rendering,
     "contact-sheet": contact_sheet,
