@@ -97,9 +97,10 @@ def _level_warnings(
     left = [
         light for light, seen, out in zip(station.ids, view.inside & view.toward, dead, strict=True) if seen and not out
     ]
+    without = f" without {' '.join(row['lights'])}" if row["lights"] else ""
     yield (
-        f"{what} a pose is not valid everywhere (z {where} m); worst at {row['z_m']:.1f} m without"
-        f" {' '.join(row['lights']) or 'any dead'}, where {' '.join(left) or 'no light'} can be seen;"
+        f"{what} a pose is not valid everywhere (z {where} m); worst at {row['z_m']:.1f} m{without},"
+        f" where {' '.join(left) or 'no light'} can be seen;"
         f" {_level_move(station, camera, config, replace(approach, step_hz=_STEP_HZ), dead)}"
     )
 

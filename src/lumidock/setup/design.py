@@ -32,7 +32,7 @@ from lumidock.station import Color, Name, Station, Vector, load_station
 from lumidock.yamlfile import read_mapping, validate
 
 _WORST_SETS, _NEW_SETS = 3, 1  # of dead lights in one evaluation: those that were worst lately, and others by chance
-_SEARCH_HZ = 1.0  # steps of the bound in the search; the layout that is found is judged at twice that
+_SEARCH_HZ = 0.5  # steps of the bound in the search; the layout that is found is judged at four times that
 _FORGET = 0.9  # how much of a set's last ratio counts when it was not tried again
 _FIRST_SPREAD = 0.25  # of a rail's length
 _SPACING_WEIGHT, _CONFUSION_WEIGHT = 20.0, 100.0  # cost per m that is missing; twice the ratio costs 0.3
