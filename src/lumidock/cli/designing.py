@@ -69,7 +69,8 @@ def _design(
         from lumidock.report.design_page import DesignView, design_page
 
         rival = load_station(shipped_or_path("station", DEFAULT_STATION))
-        rival_approach = approach_of(spec, rival)
+        reach = dict.fromkeys(rival.color, max(spec.reach_m.values())) | spec.reach_m
+        rival_approach = approach_of(spec.model_copy(update={"reach_m": reach}), rival)
         rival_judged = strength(rival, lens, Config(), rival_approach, dead_sets(len(rival), min(spec.dead, 1)))
         alone = strength(
             found.station, lens, Config(), approach_of(spec, found.station), dead_sets(len(found.station), 1)
