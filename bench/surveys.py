@@ -24,7 +24,7 @@ from lumidock.setup.survey import Survey, clear_poses, prior_of, survey
 from lumidock.setup.unknown import first_layout
 from lumidock.station import Station
 
-DOCKS = 30
+DOCKS = 6
 FIRST_SEED = 41_000
 _SECONDS_APART = 0.2  # frames of a docking
 _TAPE, _TAPE_SIGMA_M = ("F1", "R5"), 0.002
