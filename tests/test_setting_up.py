@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from docks import BuiltDock, built_dock, taped
+from bench.built_docks import BuiltDock, built_dock, taped
 
 from lumidock.camera import save_camera
 from lumidock.station import load_station

@@ -1,5 +1,6 @@
 import json
 import math
+import re
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,8 @@ from conftest import assert_close
 from lumidock.camera import load_camera
 from lumidock.cli.shared import shipped_or_path
 from lumidock.config import Config
+from lumidock.evaluation.dead_lights import NO_LEVEL, Approach, least_confusion_m
+from lumidock.evaluation.station_advice import dead_light_rows, warnings
 from lumidock.evaluation.station_check import Requirements, head_on, in_view, inspect_station
 from lumidock.station import load_station
 
@@ -122,6 +125,41 @@ def test_the_stations_own_alert_limits_decide_what_is_valid(tmp_path):
     result = inspect_station(load_station(tmp_path / "strict.yaml"), LENS, Config(), REQUIRED)
     assert not any(row["valid"] for row in result["corridor"])
     assert "z < 100 m: lateral 0.001 m" in result["alert_limits"]
+
+
+def test_more_dead_lights_are_never_better_and_the_warning_moves_a_light_that_helps(tmp_path):
+    station = dock(tmp_path / "a.yaml", [[0.5, 0.4, 0], [-0.5, 0.3, 0], [-0.4, -0.4, 0], [0.3, -0.45, 0], [0.9, 0, 0]])
+    approach = Approach(3.0, 1.6, 0.2, np.full(5, np.inf))
+    rows = dead_light_rows(station, LENS, Config(), approach, 2)
+    assert [len(row["lights"]) for row in rows] == [0, 1, 2]
+    assert rows[0]["worst"] <= rows[1]["worst"] <= rows[2]["worst"] == NO_LEVEL  # three lights give no pose
+    assert all((row["worst"] >= 1.0) == bool(row["not_valid"]) for row in rows)
+    assert rows[2]["not_valid"][-1][1] == pytest.approx(1.6, abs=0.2)
+
+
+def test_a_warning_moves_a_light_that_parts_what_is_confused(tmp_path):
+    square = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]], float)
+    station = dock(tmp_path / "a.yaml", square)
+    checked = inspect_station(station, LENS, Config(), REQUIRED)
+    checked["dead_lights"] = []
+    told = warnings(station, LENS, Config(), Approach(4.0, 2.0, 0.2, np.full(4, np.inf)), checked)
+    assert any("in one plane" in text for text in told)
+    (text,) = [text for text in told if "layer front is easily confused" in text]
+    found = re.search(r"move L(\d) by 0\.1 m along ([+-])([xyz]): .* becomes (\S+) m", text)
+    square[int(found[1]), "xyz".index(found[3])] += float(f"{found[2]}0.1")
+    assert least_confusion_m(dock(tmp_path / "b.yaml", square))["front"] == pytest.approx(float(found[4]), abs=6e-4)
+    assert float(found[4]) > 0.01
+
+
+def test_depth_counts_where_lights_are_confused(tmp_path):
+    flat = [[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]
+    deep = [[1, 1, 0], [-1, 1, -3], [-1, -1, 0], [1, -1, 0]]
+    row = [
+        inspect_station(dock(tmp_path / "a.yaml", p), LENS, Config(), REQUIRED)["confusions"][0]["assignment_m"]
+        for p in (flat, deep)
+    ]
+    # from 18 m a light 3 m deeper seems 1 / 7 nearer to the axis; a quarter turn is no roll, so that nothing else fits
+    assert row[1] != pytest.approx(row[0], abs=0.01)
 
 
 def test_many_lights_are_looked_at_in_bounded_time(tmp_path):

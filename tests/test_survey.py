@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from docks import BuiltDock, built_dock, shape_error, taped
+from bench.built_docks import BuiltDock, built_dock, shape_error, taped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from docks import built_dock
+from bench.built_docks import built_dock
 
 from lumidock.errors import InputError
 from lumidock.setup.gauge import aligned

@@ -106,9 +106,12 @@ def test_drawn_boards_give_the_camera_that_drew_them(kind):
     assert np.abs(got.camera.center_px - camera.center_px).max() < 2.0
 
 
-def _picture(board: Board, camera: Camera, rng: np.random.Generator) -> np.ndarray:
-    """A picture (H, W) of the board: a print of it, seen through a homography."""
-    per_m = 2000.0
+_PRINT_PER_M = 2000.0
+
+
+def _print(board: Board) -> np.ndarray:
+    """The board as it is printed, with a white border of 60 pixels."""
+    per_m = _PRINT_PER_M
     width, height = round(board.columns * board.square_m * per_m), round(board.rows * board.square_m * per_m)
     if board.kind == "charuco":
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
@@ -117,10 +120,21 @@ def _picture(board: Board, camera: Camera, rng: np.random.Generator) -> np.ndarr
     else:
         cells = np.add.outer(np.arange(board.rows), np.arange(board.columns)) % 2
         print_ = np.kron(cells, np.ones((80, 80))).astype(np.uint8) * 255
-    print_ = cv2.copyMakeBorder(print_, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+    return cv2.copyMakeBorder(print_, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+
+
+def _held(board: Board, rng: np.random.Generator) -> tuple[Array, Array]:
+    """How a diver holds the board: its turn, and where its corner is, before the camera."""
     R = so3_exp(rng.uniform(-1, 1, 3) * [0.5, 0.5, 0.3])
     middle = np.array([board.columns, board.rows, 0.0]) * board.square_m / 2.0
     t = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.5, 0.7)]) - R @ middle
+    return R, t
+
+
+def _picture(board: Board, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+    """A picture (H, W) of the board: a print of it, seen through a homography."""
+    per_m, print_ = _PRINT_PER_M, _print(board)
+    R, t = _held(board, rng)
     to_board = np.array([[1 / per_m, 0, -59.5 / per_m], [0, 1 / per_m, -59.5 / per_m], [0, 0, 1]])
     H = camera.K @ np.column_stack([R[:, 0], R[:, 1], t]) @ to_board
     big = cv2.warpPerspective(print_, np.diag([2.0, 2.0, 1.0]) @ _half(H), (2 * SIZE[0], 2 * SIZE[1]), borderValue=90)
@@ -192,3 +206,34 @@ def test_a_pinhole_cannot_say_what_a_port_does():
     port, pinhole = (calibrate(BOARD, views, SIZE, port=guess) for guess in (PortGuess(), None))
     assert port.rms_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.1)
     assert pinhole.rms_px > 1.5 * port.rms_px
+
+
+def _refracted(board: Board, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+    """A picture (H, W) of the board, each ray traced from the lens through the port by Snell's law."""
+    R, t = _held(board, rng)
+    u, v = np.meshgrid(np.arange(2 * SIZE[0]) * 0.5 - 0.25, np.arange(2 * SIZE[1]) * 0.5 - 0.25)
+    air = np.stack([(u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1]], axis=-1)
+    sine = air / np.sqrt(1.0 + (air**2).sum(axis=-1, keepdims=True)) / camera.port.index
+    water = np.concatenate([sine, np.sqrt(1.0 - (sine**2).sum(axis=-1, keepdims=True))], axis=-1)
+    window = np.concatenate([air, np.ones((*u.shape, 1))], axis=-1) * camera.port.distance_m
+    far = ((t - window) @ R[:, 2]) / (water @ R[:, 2])
+    on_board = (window + far[..., None] * water - t) @ R[:, :2]
+    at = (on_board * _PRINT_PER_M + 59.5).astype(np.float32)
+    big = cv2.remap(_print(board), at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=90)
+    return cv2.resize(big, SIZE, interpolation=cv2.INTER_AREA)
+
+
+@pytest.mark.parametrize(
+    "guess", [PortGuess(PORT.distance_m), PortGuess()], ids=["known distance", "estimated distance"]
+)
+def test_boards_rendered_through_a_port_give_the_lens_as_well_as_opencv_fits_them(guess):
+    camera, rng = Camera(*SIZE, IN_AIR, port=PORT), np.random.default_rng(3)
+    pictures = [_refracted(BOARD, camera, rng) for _ in range(14)]
+    found = [one for k, picture in enumerate(pictures) if (one := find_board(BOARD, Frame(str(k), k, picture)))]
+    assert len(found) >= 12
+    got = calibrate(BOARD, found, SIZE, port=guess)
+    objects = [BOARD.corners_m()[one.corner].astype(np.float32) for one in found]
+    pixels = [one.uv.astype(np.float32)[:, None] for one in found]
+    theirs = cv2.calibrateCamera(objects, pixels, SIZE, np.eye(3), np.zeros(5))[0]
+    assert np.abs(got.camera.focal_px / camera.focal_px - 1.0).max() < 0.002
+    assert got.rms_px < 1.1 * theirs

@@ -29,7 +29,7 @@ from lumidock.station import load_station
 
 @station.command("design", epilog=example("lumidock station design cage.spec.yaml --out dock.yaml --page dock.html"))
 def _design(
-    source: Annotated[Path, typer.Argument(metavar="SPEC", help="What the structure offers and what is asked of it.")],
+    source: Annotated[str, typer.Argument(metavar="SPEC", help="Design file, or the name of a shipped one.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Station file to write.")],
     camera: CameraOption = None,
     page: Annotated[Path | None, typer.Option(metavar="HTML", help="Write a page about the dock there.")] = None,
@@ -45,7 +45,7 @@ def _design(
     for file in (out, page):
         if file is not None:
             require_new(file, force)
-    spec = load_spec(source)
+    spec = load_spec(shipped_or_path("stations/design", source))
     spec = spec if seed is None else spec.model_copy(update={"seed": seed})
     lens = load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))
     with scratch_folder() as work, progress_bar("design") as progress:
@@ -53,7 +53,7 @@ def _design(
         judged = strength(
             found.station, lens, Config(), approach_of(spec, found.station), dead_sets(len(found.station), spec.dead)
         )
-    confusion = least_confusion_m(found.station)
+    confusion = least_confusion_m(found.station, np.deg2rad(spec.roll_deg))
     worst = int(judged.ratio.argmax())
     dead = [found.station.ids[i] for i in judged.dead[int(judged.worst[worst])]]
     told = (
@@ -62,14 +62,15 @@ def _design(
         f" least confusion {', '.join(f'{k} {v:.3f} m' for k, v in confusion.items())}"
     )
     options = "" if seed is None else f" --seed {seed}"
-    about = f"Made by: lumidock station design {source.name} --out {out.name}{options}\n{told}"
+    about = f"Made by: lumidock station design {Path(source).name} --out {out.name}{options}\n{told}"
     write_station_file(dict(found.content), out, about)
     if page is not None:
         from lumidock.report import page as pages
         from lumidock.report.design_page import DesignView, design_page
 
         rival = load_station(shipped_or_path("station", DEFAULT_STATION))
-        rival_approach = approach_of(spec, rival)
+        reach = dict.fromkeys(rival.color, max(spec.reach_m.values())) | spec.reach_m
+        rival_approach = approach_of(spec.model_copy(update={"reach_m": reach}), rival)
         rival_judged = strength(rival, lens, Config(), rival_approach, dead_sets(len(rival), min(spec.dead, 1)))
         alone = strength(
             found.station, lens, Config(), approach_of(spec, found.station), dead_sets(len(found.station), 1)

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from lumidock.camera import load_camera
@@ -34,14 +35,23 @@ def _check(
     ] = 1.5,
     lights: Annotated[int, typer.Option(metavar="N", min=1, help="Lights of a layer that have to be in view ...")] = 4,
     from_z: Annotated[float, typer.Option(metavar="Z", help="... from this many metres to the docking point.")] = 20.0,
+    dead: Annotated[int, typer.Option(metavar="N", min=0, max=2, help="Try any so many lights dead.")] = 2,
+    speed: Annotated[
+        float, typer.Option(metavar="M/S", min=0.02, help="Speed of the approach with lights dead.")
+    ] = 0.2,
     as_json: AsJson = False,
 ) -> None:
-    """Check what is in view, confused and measured; exit code 1 on failure."""
+    """Check what is in view, confused, measured, and left with lights dead; exit code 1 on failure."""
+    from lumidock.evaluation.dead_lights import Approach
+    from lumidock.evaluation.station_advice import dead_light_rows, warnings
     from lumidock.report.station_picture import draw_station
 
     dock = load_station(shipped_or_path("station", source))
     lens = load_camera(shipped_or_path("camera", camera or DEFAULT_CAMERA))
     result = inspect_station(dock, lens, Config(), Requirements(confusion_px, lights, from_z))
+    approach = Approach(from_z, float(dock.docking_point[2]), speed, np.full(len(dock), np.inf))
+    result["dead_lights"] = dead_light_rows(dock, lens, Config(), approach, dead)
+    result["warnings"] = warnings(dock, lens, Config(), approach, result)
     if picture is not None:
         draw_station(dock, result, picture)
     if as_json:
@@ -68,8 +78,11 @@ def _print(result: dict[str, Any]) -> None:
         cells = [_misfit(row[f"{kind}_m"], row[f"{kind}_px"]) for kind in ("assignment", "mirror")]
         print(f"{row['layer']:10} {row['seen']:4}   {cells[0]:30}  {cells[1]}")
     _print_self_fits(result)
+    _print_dead_lights(result["dead_lights"])
     print()
     print(_expected(result["corridor"]))
+    for text in result["warnings"]:
+        print(f"WARNING: {text}")
     for text in result["failed"]:
         print(f"FAILED: {text}")
     if not result["failed"]:
@@ -98,6 +111,17 @@ def _print_self_fits(result: dict[str, Any]) -> None:
         print("  nowhere else")
     if result["unsafe_roll_deg"] is not None:
         print(f"unsafe beyond {result['unsafe_roll_deg']:.1f} degrees of roll without an attitude sensor")
+
+
+def _print_dead_lights(rows: list[dict[str, Any]]) -> None:
+    """The worst level over its limit on a slow approach, with more and more lights dead."""
+    print("\nworst protection level over its alert limit on a slow approach; below 1 a pose is valid all the way")
+    for row in rows:
+        what = ("all lights lit", "any one dead", "any two dead")[row["dead"]]
+        worst = f" without {' '.join(row['lights'])}" if row["lights"] else ""
+        where = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in row["not_valid"])
+        over = f"; not valid at z {where} m" if where else ""
+        print(f"  {what:14} {row['worst']:6.2f} at z {row['z_m']:.1f} m{worst}{over}")
 
 
 def _corridor_line(row: dict[str, Any]) -> str:

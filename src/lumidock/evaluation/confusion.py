@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import combinations, permutations
 
@@ -12,6 +13,8 @@ from lumidock.datatypes import Array
 
 _Complex = NDArray[np.complex128]
 _SCALE = (0.5, 2.0)  # a layer seen at half or double its size means a range that is wrong by as much, which is noticed
+CONFUSED_WITHIN_RAD = math.radians(15.0)  # roll of a vehicle that its own attitude sensor would not notice
+CONFUSION_AT_M = 18.0  # range from which lights are compared, and at which a misfit is given in pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +27,7 @@ class Confusion:
 
 
 def worst_confusion(
-    p_dock: Array, *, seen: int, max_roll_rad: float = np.deg2rad(15.0), mirrored: bool = False
+    p_dock: Array, *, seen: int, max_roll_rad: float = CONFUSED_WITHIN_RAD, mirrored: bool = False
 ) -> Confusion:
     """The best-fitting wrong assignment of any `seen` lights of `p_dock` (N, 3); lights are indices into it.
 
@@ -46,6 +49,12 @@ def worst_confusion(
             if residuals[best] < worst.residual_m:
                 worst = Confusion(float(residuals[best]), subset, tuple(wrong[best].tolist()))
     return worst
+
+
+def apparent(p_dock: Array) -> Array:
+    """Lights (N, 3) where they seem to stand in the plane of the nearest, seen from `CONFUSION_AT_M` before it."""
+    behind = p_dock[:, 2:].max() - p_dock[:, 2:]
+    return np.asarray(p_dock * (CONFUSION_AT_M / (CONFUSION_AT_M + behind)))
 
 
 def _residuals(assigned: _Complex, observed: _Complex, max_roll: float) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Indices
-from lumidock.evaluation.confusion import worst_confusion
+from lumidock.evaluation.confusion import CONFUSED_WITHIN_RAD, apparent, worst_confusion
 from lumidock.evaluation.cramer_rao import Bound
 from lumidock.evaluation.station_check import head_on, in_view
 from lumidock.station import Station
@@ -23,7 +23,6 @@ from lumidock.station import Station
 _FRAME_RATE_HZ = 15.0  # of the camera; the bound takes fewer steps, each with the noise of the frames it stands for
 _RUN_IN_M = 4.0
 NO_LEVEL = 20.0  # the ratio where there is no level at all, and the most that one counts
-_APPARENT_FROM_M = 18.0  # where lights of one layer are compared as they appear
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,17 +110,18 @@ def strength(
     return Strength(approach.z_m(), ratios.max(axis=0), ratios.argmax(axis=0), dead, alone)
 
 
-def least_confusion_m(station: Station) -> dict[str, float]:
+def least_confusion_m(station: Station, max_roll_rad: float = CONFUSED_WITHIN_RAD) -> dict[str, float]:
     """Per layer, the residual in m of the wrong assignment, mirror images included, that fits four lights best.
 
-    Lights of one layer at different depths are compared as they appear from 18 m, so that depth counts.
+    Lights of one layer at different depths are compared as they appear from afar, so that depth counts.
     """
     out = {}
     for layer in station.layers_front_to_rear():
-        p = station.p_dock[station.lights_of(layer)]
+        p = apparent(station.p_dock[station.lights_of(layer)])
         seen = min(4, len(p))
-        nearest = p[:, 2].max()
-        apparent = p * (_APPARENT_FROM_M / (_APPARENT_FROM_M + nearest - p[:, 2]))[:, None]
-        worst = [worst_confusion(apparent, seen=seen, mirrored=mirrored).residual_m for mirrored in (False, True)]
+        worst = [
+            worst_confusion(p, seen=seen, max_roll_rad=max_roll_rad, mirrored=mirrored).residual_m
+            for mirrored in (False, True)
+        ]
         out[layer] = min(worst) if seen >= 3 else float("inf")
     return out

@@ -11,13 +11,12 @@ import numpy as np
 from lumidock.camera import Camera
 from lumidock.config import Config
 from lumidock.datatypes import Array, Indices
-from lumidock.evaluation.confusion import Confusion, worst_confusion
+from lumidock.evaluation.confusion import CONFUSION_AT_M, Confusion, apparent, worst_confusion
 from lumidock.evaluation.cramer_rao import Bound
 from lumidock.evaluation.symmetry import SelfFit, self_fits, unsafe_roll_rad
 from lumidock.pose import project_lights
 from lumidock.station import Station
 
-CONFUSION_AT_M = 18.0  # range at which the misfit of a confusion is given in pixels
 _START_Z_M, _SPEED_M_S, _RATE_HZ = 30.0, 1.0, 10.0
 _ROWS_Z_M = (30, 24, 20, 18, 15, 12, 10, 8, 6, 5, 4, 3, 2, 1.5, 1, 0.5, 0, -0.5, -1, -2, -3)
 _MAX_ASSIGNMENTS = 2_000_000  # that are tried for one row of confusions
@@ -157,7 +156,7 @@ def _confusions(station: Station, camera: Camera, layer: str) -> list[dict[str, 
         row: dict[str, Any] = {"layer": layer, "seen": seen}
         for kind, mirrored in (("assignment", False), ("mirror", True)):
             costly = math.comb(n, seen) * math.perm(n, seen) > _MAX_ASSIGNMENTS
-            worst = None if costly else worst_confusion(station.p_dock[lights], seen=seen, mirrored=mirrored)
+            worst = None if costly else worst_confusion(apparent(station.p_dock[lights]), seen=seen, mirrored=mirrored)
             row |= _confusion_fields(kind, worst, [station.ids[light] for light in lights], camera)
         rows.append(row)
     return rows

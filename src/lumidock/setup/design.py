@@ -32,7 +32,7 @@ from lumidock.station import Color, Name, Station, Vector, load_station
 from lumidock.yamlfile import read_mapping, validate
 
 _WORST_SETS, _NEW_SETS = 3, 1  # of dead lights in one evaluation: those that were worst lately, and others by chance
-_SEARCH_HZ = 1.0  # steps of the bound in the search; the layout that is found is judged at twice that
+_SEARCH_HZ = 0.5  # steps of the bound in the search; the layout that is found is judged at four times that
 _FORGET = 0.9  # how much of a set's last ratio counts when it was not tried again
 _FIRST_SPREAD = 0.25  # of a rail's length
 _SPACING_WEIGHT, _CONFUSION_WEIGHT = 20.0, 100.0  # cost per m that is missing; twice the ratio costs 0.3
@@ -79,6 +79,7 @@ class Spec(_Strict):
     speed_m_s: Positive = 0.2
     reach_m: dict[Color, float] = {"white": 27.0, "blue": 21.0}
     confusion_m: Annotated[float, Field(ge=0.0)] = 0.085
+    roll_deg: Annotated[float, Field(ge=0.0, le=180.0)] = 15.0
     spacing_m: Annotated[float, Field(ge=0.0)] = 0.25
     seed: Annotated[int, Field(ge=1, le=10**9)] = 1
     evaluations: Annotated[int, Field(ge=20, le=100_000)] = 400
@@ -105,7 +106,7 @@ def approach_of(spec: Spec, station: Station) -> Approach:
     if missing:
         raise InputError(f"{spec.name}: reach_m says nothing of {missing[0]} lights")
     reach = np.array([spec.reach_m[color] for color in station.color])
-    return Approach(spec.from_z_m, min(spec.docking_point[2], 0.0), spec.speed_m_s, reach)
+    return Approach(spec.from_z_m, spec.docking_point[2], spec.speed_m_s, reach)
 
 
 def design(
@@ -134,7 +135,7 @@ def design(
         progress(judge.evaluations, spec.evaluations)
         # a set that was not tried flatters a layout, so what seems better than the best is judged by all of them
         u = np.asarray(asked[int(np.argmin(costs))])
-        if min(costs) < best_cost and (cost := judge.full_cost(u)) < best_cost:
+        if min(costs) < best_cost and (cost := judge.full_cost(u, best_cost)) < best_cost:
             best, best_cost = u, cost
     content = layout(spec, best)
     return Design(content, judge.station(best), best_cost, judge.evaluations)
@@ -186,11 +187,11 @@ class _Judge:
         others = self._rng.choice(len(self._dead), min(_NEW_SETS, len(self._dead)), replace=False)
         return self._judged(u, sorted({*worst.tolist(), *others.tolist()}))
 
-    def full_cost(self, u: Array) -> float:
-        """Cost by all sets of dead lights."""
-        return self._judged(u, list(range(len(self._dead))))
+    def full_cost(self, u: Array, enough: float) -> float:
+        """Cost by all sets of dead lights, or one above `enough` as soon as it is known to be."""
+        return self._judged(u, np.argsort(-self._bad, kind="stable").tolist(), enough)
 
-    def _judged(self, u: Array, sets: list[int]) -> float:
+    def _judged(self, u: Array, sets: list[int], enough: float = np.inf) -> float:
         try:
             station = self.station(u)
         except InputError:  # two lights at one place, or all in one place
@@ -198,13 +199,14 @@ class _Judge:
         approach = replace(approach_of(self.spec, station), step_hz=_SEARCH_HZ)
         seen = seen_along(station, self.camera, approach)
         self._bad *= _FORGET
-        ratios = []
+        always, worst = self._faults(station) + self._blind(seen, approach), -np.inf
         for k in sets:
             lit = seen & ~np.isin(np.arange(len(station)), self._dead[k])
-            ratio = level_ratios(station, self.camera, self.config, approach, lit)
-            ratios.append(ratio)
-            self._bad[k] = _badness(ratio)
-        return max(_badness(ratio) for ratio in ratios) + self._faults(station) + self._blind(seen, approach)
+            self._bad[k] = _badness(level_ratios(station, self.camera, self.config, approach, lit))
+            worst = max(worst, float(self._bad[k]))
+            if worst + always > enough:
+                break
+        return worst + always
 
     def _blind(self, seen: np.ndarray, approach: Approach) -> float:
         """The share of the approach where some set of dead lights leaves fewer than four in view, for a start."""
@@ -212,12 +214,15 @@ class _Judge:
         left = np.array([(seen[judged] & ~np.isin(np.arange(seen.shape[1]), dead)).sum(axis=1) for dead in self._dead])
         return float((left.min(axis=0) < LEAST_LIGHTS).mean())
 
+    def confusion_m(self, station: Station) -> dict[str, float]:
+        return least_confusion_m(station, np.deg2rad(self.spec.roll_deg))
+
     def _faults(self, station: Station) -> float:
         """What confusion, lights too near to each other and lights in keep-out boxes cost."""
         gaps = np.linalg.norm(station.p_dock[:, None] - station.p_dock[None], axis=2)
         gaps[np.diag_indices(len(gaps))] = np.inf
         crowded = np.maximum(self.spec.spacing_m - gaps.min(axis=1), 0.0).sum()
-        alike = sum(max(self.spec.confusion_m - least, 0.0) for least in least_confusion_m(station).values())
+        alike = sum(max(self.spec.confusion_m - least, 0.0) for least in self.confusion_m(station).values())
         inside = sum(
             bool(((p >= box.low) & (p <= box.high)).all()) for p in station.p_dock for box in self.spec.keep_out
         )

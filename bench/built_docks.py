@@ -28,6 +28,7 @@ class BuiltDock:
 def built_dock(
     seed: int, *, off_m: float = 0.05, dockings: int = 2, interval_s: float = 0.2, settings: tuple[str, ...] = ()
 ) -> BuiltDock:
+    """The paper's cage each light off by 1 sigma `off_m` per axis, and dockings with `interval_s` between frames."""
     rng = np.random.default_rng([seed, 99])
     drawing = load_station(shipped_or_path("station", "cage-2x2x5"))
     camera = load_camera(shipped_or_path("camera", "imx264-60deg"))
@@ -49,6 +50,7 @@ def built_dock(
 
 
 def taped(dock: BuiltDock, a: str, b: str) -> tuple[int, int, float]:
+    """The indices of two lights, and how far apart they stand."""
     i, j = dock.drawing.ids.index(a), dock.drawing.ids.index(b)
     return i, j, float(np.linalg.norm(dock.built.p_dock[i] - dock.built.p_dock[j]))
 
