@@ -24,17 +24,14 @@ from lumidock.setup.survey import Survey, clear_poses, prior_of, survey
 from lumidock.setup.unknown import first_layout
 from lumidock.station import Station
 
-DOCKS = 6
+DOCKS = 2
 FIRST_SEED = 41_000
 _SECONDS_APART = 0.2  # frames of a docking
 _TAPE, _TAPE_SIGMA_M = ("F1", "R5"), 0.002
 _WRONG = 0.03  # share of the identities that are exchanged within their frame
 _OFF_M, _FAR_OFF_M = 0.05, 0.10
-_CAMERA_S, _EVERY = (
-    1.0 / 15.0,
-    3,
-)  # without a drawing lights are followed at the camera's rate
-_SOLVED_M = 0.01  # rms of the shape: below the 2-10 cm of a layout whose lights were mixed up, above the rest
+_CAMERA_S, _EVERY = 1.0 / 15.0, 3  # without a drawing lights are followed at the camera's rate
+_SOLVED_M = 0.01  # rms of the shape: three times what is wanted; a layout whose lights were mixed up is centimetres off
 
 
 @dataclass(frozen=True, slots=True)
