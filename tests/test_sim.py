@@ -385,7 +385,7 @@ def test_a_scenario_is_simulated_on_the_station_that_it_is_made_for():
         "plate": "plate",
         "funnel": "funnel-ring",
     }
-    with pytest.raises(InputError, match=r"^approach: station mud is not shipped; there are cage-2x2x5, "):
+    with pytest.raises(InputError, match=r"^approach: station mud is not shipped; there are cage-13, cage-2x2x5, "):
         station_of(load_scenario("approach", ("station=mud",)))
 
 
