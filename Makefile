@@ -4,7 +4,7 @@ UV     ?= $(shell command -v uv)
 BIN    := .venv/bin
 READY  := .venv/.ready
 
-.PHONY: setup demo test slow peers compat bench docs lint lock clean
+.PHONY: setup demo test coverage slow peers compat bench docs lint lock clean
 setup: $(READY)
 
 $(READY): requirements.lock pyproject.toml
