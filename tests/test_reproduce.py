@@ -226,6 +226,7 @@ def fixes_of(folder):
         return [{k: v for k, v in row.items() if k != "latency_us"} for row in csv.DictReader(file)]
 
 
+@pytest.mark.slow
 def test_frames_in_memory_give_the_fixes_of_frames_on_disk(tmp_path):
     settings = ("path.frame_interval_s=2.5", "stream.half_written=0.2", "stream.duplicated=0.3")
     simulation = Simulation(DOCK, "stream-faults", settings, 5)
