@@ -169,20 +169,18 @@ def _tracked(
     if sees_two_layers(first.last.count):
         tracked = replace(tracked, contradiction=None)
     overlooks = tracking.overlooks(first, moment.frame, context)
-    open_ = first.last.n_used >= CHECKED_LIGHTS and not verify.is_proven(
-        first, tracked.margin, context.config.integrity
-    )
-    if not (open_ or overlooks):
+    proven = verify.is_proven(first, tracked.margin, context.config.integrity)
+    provable = not proven and first.last.n_used >= CHECKED_LIGHTS
+    if not (provable or overlooks):
         return integrity.assess(tracked, detections, "tracking", context)
     found = moment.acquire()
     same_array = verify.finds_array(found, first.last.assignment, context.config.match)
-    if (overlooks and _shows_two_layers(found, context)) or (
-        open_ and not same_array and verify.is_answer(found, context.config.match)
-    ):
+    elsewhere = verify.is_answer(found, context.config.match) and not same_array
+    if (overlooks and _shows_two_layers(found, context)) or (provable and elsewhere):
         # what the track has learned meanwhile is in doubt too; a failure, so that the next search is full
         doubted = replace(state, confirmed=False, calibration=None, failures=1)
         return _acquired(doubted, followed, detections, moment, found, still_held=followed[:1])
-    if open_ and same_array:
+    if provable and same_array:
         tracked = replace(tracked, margin=max(tracked.margin, found.certainty))
     if overlooks:
         against = moment.displaced_layer(first) or tracked.contradiction
@@ -221,14 +219,10 @@ def _lost(
     state = replace(state, dark_frames=state.dark_frames + 1 if dark else 0)
     if state.confirmed and followed and doubt == "residual" and state.failures == 1:  # one in many thousands, by chance
         return _coasting(state, detections, moment.context, doubt)
-    found = moment.acquire()
+    found, held = moment.acquire(), followed[:1] if state.confirmed and doubt == "too_few" else ()
     # three lights prove nothing, but the track that they hold is not given up for another array of one frame
-    holds = state.confirmed and doubt == "too_few"
-    held = (
-        followed[:1]
-        if holds and not verify.finds_array(found, followed[0].last.assignment, moment.context.config.match)
-        else ()
-    )
+    if held and verify.finds_array(found, held[0].last.assignment, moment.context.config.match):
+        held = ()
     return _acquired(state, followed, detections, moment, found, doubt=doubt, still_held=held)
 
 
